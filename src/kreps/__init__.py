@@ -1,0 +1,1 @@
+"""Kernel-based, non-parametric policy search."""

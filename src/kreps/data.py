@@ -1,0 +1,198 @@
+"""What is learnt from: the task's shape, roll-outs, the window kept of them, its transitions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+
+from kreps.arrays import BoolArray, FloatArray, IntArray, as_float
+from kreps.errors import ConfigurationError, DataError
+
+
+@dataclass(frozen=True)
+class TaskSpec:
+    """What the learner must know of a task; everything else it learns.
+
+    Attributes:
+        observation_size: number of coordinates of an observation.
+        action_low, action_high: (da,) finite limits of the actions, in the task's units.
+        periodic: the observation coordinates that are angles in rad (period 2 pi).
+    """
+
+    observation_size: int
+    action_low: FloatArray
+    action_high: FloatArray
+    periodic: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "action_low", np.atleast_1d(as_float(self.action_low)))
+        object.__setattr__(self, "action_high", np.atleast_1d(as_float(self.action_high)))
+        object.__setattr__(self, "periodic", tuple(sorted(int(i) for i in self.periodic)))
+        if self.observation_size < 1:
+            raise ConfigurationError(
+                f"observation_size = {self.observation_size}, but at least one coordinate is needed"
+            )
+        low, high = self.action_low, self.action_high
+        if low.ndim != 1 or low.shape != high.shape or low.size == 0:
+            raise ConfigurationError(
+                f"action limits have shapes {low.shape} and {high.shape}; "
+                "give two vectors of the same positive length"
+            )
+        if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+            raise ConfigurationError(
+                f"action limits {low} to {high} must be finite and low < high; "
+                "the policy needs a scale for its actions, so give a bounded range"
+            )
+        outside = [i for i in self.periodic if not 0 <= i < self.observation_size]
+        if outside:
+            raise ConfigurationError(
+                f"periodic coordinates {outside} do not exist: observations have "
+                f"{self.observation_size} coordinates, numbered from 0"
+            )
+
+    @property
+    def action_size(self) -> int:
+        return len(self.action_low)
+
+    @property
+    def action_centre(self) -> FloatArray:
+        return 0.5 * (self.action_low + self.action_high)
+
+    @property
+    def action_scale(self) -> FloatArray:
+        """Half the range (da,): actions in these units lie in [-1, 1] around the centre."""
+        return 0.5 * (self.action_high - self.action_low)
+
+    def clip(self, actions: FloatArray) -> FloatArray:
+        """The *applied* actions: what the actuators make of the commanded ones."""
+        return np.clip(actions, self.action_low, self.action_high)
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One roll-out of ``T >= 1`` steps, copied at construction so that no buffer can overwrite it.
+
+    Attributes:
+        observations: (T + 1, ds); row t + 1 is the true successor of row t, the last one
+            included (what came *before* any restart).
+        actions: (T, da) as the policy commanded them, before clipping.
+        rewards: (T,).
+        terminated: whether the last step really ended the task (not: was cut off).
+
+    Raises:
+        DataError: wrong shapes, no step at all, NaN or infinities.
+    """
+
+    observations: FloatArray
+    actions: FloatArray
+    rewards: FloatArray
+    terminated: bool = False
+
+    def __post_init__(self) -> None:
+        for name, dimensions in (("observations", 2), ("actions", 2), ("rewards", 1)):
+            try:
+                values = np.array(getattr(self, name), dtype=np.float64)
+            except (TypeError, ValueError) as error:
+                raise DataError(f"{name} are not an array of numbers: {error}") from error
+            if values.ndim != dimensions:
+                raise DataError(
+                    f"{name} have shape {values.shape}, but {dimensions} dimensions are needed: "
+                    "observations (T + 1, ds), actions (T, da), rewards (T,)"
+                )
+            if not np.isfinite(values).all():
+                row = int(np.argwhere(~np.isfinite(values))[0, 0])
+                raise DataError(
+                    f"{name} hold NaN or an infinity, first in row {row}; "
+                    "drop the roll-out, or cut it before that step"
+                )
+            values.flags.writeable = False
+            object.__setattr__(self, name, values)
+        steps = len(self.rewards)
+        if steps == 0:
+            raise DataError("the roll-out has no step; leave empty roll-outs out")
+        if len(self.actions) != steps or len(self.observations) != steps + 1:
+            raise DataError(
+                f"{len(self.observations)} observations, {len(self.actions)} actions and {steps} "
+                "rewards do not fit together: T rewards need T actions and T + 1 observations "
+                "(the last one is the successor of the last step)"
+            )
+        object.__setattr__(self, "terminated", bool(self.terminated))
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    def check(self, task: TaskSpec) -> None:
+        """Raise `DataError` unless the widths are those of ``task``."""
+        found = self.observations.shape[1], self.actions.shape[1]
+        wanted = task.observation_size, task.action_size
+        if found != wanted:
+            raise DataError(
+                f"the roll-out has {found[0]} observation and {found[1]} action coordinates, "
+                f"the task {wanted[0]} and {wanted[1]}"
+            )
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """The n steps of some roll-outs as flat arrays; states are named by row of ``points``.
+
+    Attributes:
+        points: (n + R, ds) all states of R roll-outs in order: the set S~ of Eq. 3.
+        state, successor: (n,) rows of s_i and of s'_i.
+        start: (R,) rows of the start states.
+        actions: (n, da) commanded.
+        rewards: (n,).
+        terminated: (n,) whether step i really ended the task.
+    """
+
+    points: FloatArray
+    state: IntArray
+    successor: IntArray
+    start: IntArray
+    actions: FloatArray
+    rewards: FloatArray
+    terminated: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    @property
+    def states(self) -> FloatArray:
+        return self.points[self.state]
+
+    @classmethod
+    def of(cls, rollouts: Sequence[Rollout]) -> Transitions:
+        """Flatten at least one roll-out."""
+        lengths = np.array([len(r) for r in rollouts])
+        start = np.concatenate([[0], np.cumsum(lengths + 1)[:-1]])
+        state = np.concatenate([s + np.arange(k) for s, k in zip(start, lengths, strict=True)])
+        terminated = np.zeros(len(state), dtype=bool)
+        terminated[np.cumsum(lengths) - 1] = [r.terminated for r in rollouts]
+        return cls(
+            points=np.concatenate([r.observations for r in rollouts]),
+            state=state,
+            successor=state + 1,
+            start=start,
+            actions=np.concatenate([r.actions for r in rollouts]),
+            rewards=np.concatenate([r.rewards for r in rollouts]),
+            terminated=terminated,
+        )
+
+
+@dataclass(frozen=True)
+class Window:
+    """The latest ``capacity`` roll-outs: the forgetting mechanism of Sec. 4.1."""
+
+    capacity: int
+    rollouts: tuple[Rollout, ...] = field(default=())
+
+    def extend(self, rollouts: Iterable[Rollout]) -> Window:
+        kept = (*self.rollouts, *rollouts)[-self.capacity :]
+        return Window(self.capacity, kept)
+
+    @cached_property
+    def transitions(self) -> Transitions:
+        return Transitions.of(self.rollouts)

@@ -1,0 +1,29 @@
+"""The vectorised form of a task: many independent roll-outs advanced by one call."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from kreps.arrays import BoolArray, FloatArray
+
+
+class BatchModel(Protocol):
+    """m copies of a task in lock step, each with its own generator.
+
+    An environment that offers one as its attribute ``batch_model`` is simulated in batches.  It
+    must draw from the generators exactly what the environment draws from its own, so that both
+    forms give the same trajectories from the same seeds.
+    """
+
+    def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
+        """Start observations (m, ds)."""
+        ...
+
+    def step(
+        self, observations: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Successors (m, ds), rewards (m,) and ends (m,) for actions (m, da)."""
+        ...

@@ -1,0 +1,40 @@
+"""Anti-aliased discs and rods for ``rgb_array`` rendering: two distance functions, no dependency."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kreps.arrays import FloatArray, as_float
+
+
+class Canvas:
+    """A white square picture of ``[-extent, extent]^2`` metres with y upwards."""
+
+    def __init__(self, extent: float, size: int = 240) -> None:
+        self._pixel = 2.0 * extent / size
+        axis = (np.arange(size) + 0.5) * self._pixel - extent
+        self._x, self._y = np.meshgrid(axis, -axis)
+        self._colours = np.ones((size, size, 3))
+
+    def disc(self, centre: Sequence[float], radius: float, colour: Sequence[float]) -> None:
+        self.rod(centre, centre, radius, colour)
+
+    def rod(self, start: Any, end: Any, radius: float, colour: Sequence[float]) -> None:
+        """A line with round ends, ``radius`` wide to each side."""
+        start, along = as_float(start), as_float(end) - as_float(start)
+        x, y = self._x - start[0], self._y - start[1]
+        length = max(float(along @ along), 1e-12)
+        share = np.clip((x * along[0] + y * along[1]) / length, 0.0, 1.0)
+        distance = np.hypot(x - share * along[0], y - share * along[1])
+        self._blend(np.clip((radius - distance) / self._pixel + 0.5, 0.0, 1.0), colour)
+
+    def _blend(self, cover: FloatArray, colour: Sequence[float]) -> None:
+        self._colours += cover[..., None] * (as_float(colour) - self._colours)
+
+    def pixels(self) -> NDArray[np.uint8]:
+        """(size, size, 3) with values 0 to 255."""
+        return np.round(255.0 * self._colours).astype(np.uint8)

@@ -1,0 +1,14 @@
+"""Registers the tasks with Gymnasium, so that ``gymnasium.make("kreps/SwingUp-v0")`` finds them."""
+
+from __future__ import annotations
+
+import gymnasium as gym
+
+ENVIRONMENTS = {"kreps/SwingUp-v0": "kreps.envs.swing_up:SwingUp"}
+
+
+def register() -> None:
+    """Register every task that is not registered yet."""
+    for name, entry_point in ENVIRONMENTS.items():
+        if name not in gym.registry:
+            gym.register(id=name, entry_point=entry_point)

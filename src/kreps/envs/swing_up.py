@@ -1,0 +1,179 @@
+"""The underpowered swing-up with control noise (Sec. 4.4): dynamics, batch form, environment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+
+from kreps.arrays import BoolArray, FloatArray, as_float
+from kreps.envs.drawing import Canvas
+
+MASS = 10.0  # kg
+LENGTH = 0.5  # m
+GRAVITY = 9.81  # m s^-2
+FRICTION = 0.25  # N m s
+MAX_TORQUE = 30.0  # N m
+TIME_STEP = 0.05  # s
+SUB_STEPS = 10
+INERTIA = MASS * LENGTH**2 / 3.0  # kg m^2
+WEIGHT_TORQUE = MASS * GRAVITY * LENGTH  # N m: more than MAX_TORQUE, so the task is underpowered
+NOISE = TIME_STEP**-0.5  # N m, standard deviation
+
+
+def wrap_angle(theta: FloatArray) -> FloatArray:
+    """``theta`` in [-pi/2, 3 pi/2): upright is 0, hanging is pi, the cut lies at a quarter turn."""
+    return (theta + 0.5 * np.pi) % (2.0 * np.pi) - 0.5 * np.pi
+
+
+def acceleration(theta: FloatArray, velocity: FloatArray, torque: FloatArray) -> FloatArray:
+    """``theta''`` from ``I theta'' = G sin theta + u - k theta'``, in rad s^-2."""
+    return (WEIGHT_TORQUE * np.sin(theta) + torque - FRICTION * velocity) / INERTIA
+
+
+def integrate(
+    theta: FloatArray, velocity: FloatArray, torque: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Angle and velocity after one time step of constant torque (Runge-Kutta of order four)."""
+    h = TIME_STEP / SUB_STEPS
+    for _ in range(SUB_STEPS):
+        a1 = acceleration(theta, velocity, torque)
+        v2 = velocity + 0.5 * h * a1
+        a2 = acceleration(theta + 0.5 * h * velocity, v2, torque)
+        v3 = velocity + 0.5 * h * a2
+        a3 = acceleration(theta + 0.5 * h * v2, v3, torque)
+        v4 = velocity + h * a3
+        a4 = acceleration(theta + h * v3, v4, torque)
+        theta = theta + h / 6.0 * (velocity + 2.0 * v2 + 2.0 * v3 + v4)
+        velocity = velocity + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+    return theta, velocity
+
+
+def reward(theta: FloatArray, velocity: FloatArray, torque: FloatArray) -> FloatArray:
+    """``-10 theta^2 - 0.1 theta'^2 - 0.001 a^2`` for a wrapped angle and the applied torque."""
+    return -10.0 * theta**2 - 0.1 * velocity**2 - 1e-3 * torque**2
+
+
+class SwingUpBatch:
+    """The swing-up for m roll-outs at once; see `kreps.envs.batch.BatchModel`."""
+
+    def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
+        return np.tile([np.pi, 0.0], (len(rngs), 1))
+
+    def step(
+        self, observations: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        theta, velocity = observations.T
+        torque = np.clip(actions[:, 0], -MAX_TORQUE, MAX_TORQUE)
+        noise = NOISE * np.array([rng.standard_normal() for rng in rngs])
+        rewards = reward(theta, velocity, torque)
+        theta, velocity = integrate(theta, velocity, torque + noise)
+        successors = np.stack([wrap_angle(theta), velocity], axis=1)
+        return successors, rewards, np.zeros(len(rngs), dtype=bool)
+
+
+class SwingUp(gym.Env[FloatArray, FloatArray]):
+    """
+    ## Description
+
+    A pendulum hangs from a driven joint and is to be swung up and held upright.  The motor is
+    too weak to lift it directly, so it must be swung back and forth to gain energy.  The torque
+    that acts is the commanded one, limited to what the motor gives, plus noise.  This is the
+    low-dimensional swing-up of "Learning of Non-Parametric Control Policies with High-Dimensional
+    State Features" and its companion paper.
+
+    The pendulum follows `I theta'' = G sin(theta) + u - k theta'` with inertia
+    `I = m l^2 / 3` and weight `G = m g l`, for `m = 10 kg`, `l = 0.5 m`, `g = 9.81 m s^-2` and
+    friction `k = 0.25 N m s`.  It is controlled at 20 Hz; each period is integrated by 10
+    Runge-Kutta steps of order four.  The noise on the torque has variance `1 / dt`, that is a
+    standard deviation of 4.47 N m, and is held over the period.
+
+    ## Action Space
+
+    The action is a `ndarray` with shape `(1,)`; commands beyond the limits are clipped.
+
+    | Num | Action                   | Min   | Max  | Unit |
+    |-----|--------------------------|-------|------|------|
+    | 0   | Torque, counterclockwise | -30.0 | 30.0 | N m  |
+
+    ## Observation Space
+
+    The observation is a `ndarray` with shape `(2,)` and data type float64.  The angle is given
+    as it is, not as cosine and sine: `metadata["periodic_coordinates"]` tells that it is one.
+
+    | Num | Observation                 | Min   | Max    | Unit  |
+    |-----|-----------------------------|-------|--------|-------|
+    | 0   | Angle from upright, theta   | -pi/2 | 3 pi/2 | rad   |
+    | 1   | Angular velocity, theta'    | -Inf  | Inf    | rad/s |
+
+    ## Rewards
+
+    `r = -10 theta^2 - 0.1 theta'^2 - 0.001 a^2`, with the angle in [-pi/2, 3 pi/2) and the
+    applied torque `a`: 0 at rest upright, -98.7 at rest hanging.
+
+    ## Starting State
+
+    Hanging at rest: `theta = pi`, `theta' = 0`.
+
+    ## Episode End
+
+    The task never terminates and is never truncated.  The paper's protocol restarts it with
+    probability 0.02 per step: see `kreps.envs.RandomRestart`.
+
+    ## Arguments
+
+    `render_mode`: `None` or `"rgb_array"`.
+
+    ```python
+    >>> import gymnasium as gym
+    >>> import kreps
+    >>> env = gym.make("kreps/SwingUp-v0", render_mode="rgb_array")
+
+    ```
+
+    ## Version History
+
+    * v0: Initial version.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {
+        "render_modes": ["rgb_array"],
+        "render_fps": round(1.0 / TIME_STEP),
+        "periodic_coordinates": (0,),
+    }
+    batch_model = SwingUpBatch()
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+        high = np.array([1.5 * np.pi, np.inf])
+        low = np.array([-0.5 * np.pi, -np.inf])
+        self.observation_space = gym.spaces.Box(low, high, dtype=np.float64)
+        self.action_space = gym.spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), dtype=np.float64)
+        self._observation = np.array([np.pi, 0.0])
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._observation = self.batch_model.initial([self.np_random])[0]
+        return self._observation.copy(), {}
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        successors, rewards, _ = self.batch_model.step(
+            self._observation[None], as_float(action).reshape(1, 1), [self.np_random]
+        )
+        self._observation = successors[0]
+        return self._observation.copy(), float(rewards[0]), False, False, {}
+
+    def render(self) -> Any:
+        if self.render_mode != "rgb_array":
+            return None
+        theta = self._observation[0]
+        tip = np.array([-np.sin(theta), np.cos(theta)])
+        canvas = Canvas(extent=1.25)
+        canvas.disc((0.0, 0.0), 1.0, (0.95, 0.95, 0.96))
+        canvas.rod((0.0, 0.0), tip, 0.09, (0.16, 0.38, 0.64))
+        canvas.disc((0.0, 0.0), 0.045, (0.12, 0.12, 0.14))
+        return canvas.pixels()

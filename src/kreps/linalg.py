@@ -1,0 +1,137 @@
+"""Dense linear algebra: Cholesky with reported jitter, triangular solves, pivoted Cholesky.
+
+The only file that knows which library does these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import blas, lapack
+
+from kreps.arrays import FloatArray, IntArray
+from kreps.errors import NumericalError
+
+_JITTERS = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)
+
+
+@dataclass(frozen=True)
+class Cholesky:
+    """``L L' = A + jitter I``, with ``L`` lower triangular (n, n)."""
+
+    lower: FloatArray
+    jitter: float
+
+    def solve(self, b: FloatArray) -> FloatArray:
+        """``A^-1 b`` for ``b`` of shape (n,) or (n, k)."""
+        x, _ = lapack.dpotrs(self.lower, b, lower=1)
+        return x  # type: ignore[no-any-return]
+
+    def inverse(self) -> FloatArray:
+        """``A^-1``, (n, n) and symmetric."""
+        half, _ = lapack.dpotri(self.lower, lower=1)
+        half = np.tril(half)
+        return half + np.tril(half, -1).T
+
+
+def cholesky(a: FloatArray) -> Cholesky:
+    """Factorise a symmetric positive definite matrix (n, n).
+
+    If rounding has made it indefinite, the least of 1e-12, 1e-10, 1e-8, 1e-6 times its mean
+    diagonal is added to the diagonal; what was added is reported in ``Cholesky.jitter``.
+
+    Raises:
+        NumericalError: not positive definite at the largest jitter, or not finite.
+    """
+    scale = float(np.mean(np.diagonal(a))) if len(a) else 1.0
+    for relative in _JITTERS:
+        jitter = relative * scale
+        shifted = a + jitter * np.eye(len(a)) if jitter else a
+        lower, info = lapack.dpotrf(shifted, lower=1, clean=1)
+        if info == 0 and np.isfinite(np.diagonal(lower)).all():
+            return Cholesky(lower, jitter)
+    raise NumericalError(
+        f"a {len(a)} x {len(a)} matrix with mean diagonal {scale:.3g} is not positive definite, "
+        f"even with {_JITTERS[-1]:g} of that added to its diagonal; "
+        "check the data for infinities or increase the regularisation"
+    )
+
+
+def solve_lower(lower: FloatArray, b: FloatArray) -> FloatArray:
+    """``L^-1 b`` for lower triangular ``L`` (n, n) and ``b`` (n,) or (n, k)."""
+    if b.ndim == 1:
+        return blas.dtrsv(lower, b, lower=1)  # type: ignore[no-any-return]
+    return blas.dtrsm(1.0, lower, b, lower=1)  # type: ignore[no-any-return]
+
+
+def solve_lower_transposed(lower: FloatArray, b: FloatArray) -> FloatArray:
+    """``L'^-1 b`` for lower triangular ``L`` (n, n) and ``b`` (n,) or (n, k)."""
+    if b.ndim == 1:
+        return blas.dtrsv(lower, b, lower=1, trans=1)  # type: ignore[no-any-return]
+    return blas.dtrsm(1.0, lower, b, lower=1, trans_a=1)  # type: ignore[no-any-return]
+
+
+@dataclass(frozen=True)
+class PivotedCholesky:
+    """``columns @ columns.T`` approximates the matrix; exact on the rows named by ``pivots``.
+
+    Attributes:
+        columns: (n, r).  Its rows at ``pivots`` form a lower triangular (r, r) matrix.
+        pivots: (r,) row numbers in the order in which they were chosen.
+        residual: largest diagonal entry of the part that is left out.
+    """
+
+    columns: FloatArray
+    pivots: IntArray
+    residual: float
+
+
+def pivoted_cholesky(
+    diagonal: FloatArray,
+    block_of: Callable[[IntArray], FloatArray],
+    *,
+    tolerance: float,
+    max_rank: int,
+    block: int = 48,
+) -> PivotedCholesky:
+    """Blocked pivoted Cholesky of a symmetric positive semi-definite matrix K (n, n).
+
+    Each round takes the ``block`` rows with the largest residual, orders them by a small pivoted
+    Cholesky of their own, keeps those that remain large once the earlier ones are accounted
+    for, and updates all rows with two matrix products instead of one thin update per pivot.
+
+    Args:
+        diagonal: (n,) diagonal of K.
+        block_of: maps row numbers (b,) to the columns ``K[:, rows]`` (n, b).
+        tolerance: stop when the largest residual diagonal entry is below this.
+        max_rank: stop at this many pivots.
+        block: candidates per round.
+    """
+    n = len(diagonal)
+    max_rank = min(max_rank, n)
+    columns = np.zeros((n, max_rank), order="F")
+    left = diagonal.astype(np.float64, copy=True)
+    pivots = np.empty(max_rank, dtype=np.intp)
+    rank = 0
+    while rank < max_rank and left.max() > tolerance:
+        size = min(block, max_rank - rank, n)
+        candidates = np.argpartition(-left, size - 1)[:size]
+        candidates = candidates[np.lexsort((candidates, -left[candidates]))]
+        fresh = block_of(candidates) - columns[:, :rank] @ columns[candidates, :rank].T
+        local, order, kept, _ = lapack.dpstrf(fresh[candidates], tol=tolerance, lower=1)
+        # A candidate close to an earlier one is left for a later round, where a better row
+        # than it may have turned up: this keeps the trace near that of one-by-one pivoting.
+        pivot_sizes = np.diagonal(local)[:kept] ** 2
+        kept = max(1, int(np.argmin(np.append(pivot_sizes > 0.2 * left.max(), False))))
+        order = order[:kept] - 1
+        lower = np.tril(local[:kept, :kept])
+        new = solve_lower(lower, fresh[:, order].T).T
+        columns[:, rank : rank + kept] = new
+        pivots[rank : rank + kept] = candidates[order]
+        left -= np.einsum("ij,ij->i", new, new)
+        left[pivots[: rank + kept]] = 0.0
+        np.maximum(left, 0.0, out=left)
+        rank += kept
+    return PivotedCholesky(columns[:, :rank], pivots[:rank], float(left.max(initial=0.0)))

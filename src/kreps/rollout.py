@@ -1,0 +1,209 @@
+"""Collects roll-outs: in batches where the task offers them, step by step from any environment.
+
+Both ways address their randomness by roll-out, so they give the same data from the same seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec
+from kreps.envs.batch import BatchModel
+from kreps.envs.restart import RandomRestart, restart_length
+from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
+from kreps.policies import StochasticPolicy
+from kreps.seeding import Purpose, generator, integer_seed
+
+Environment = gym.Env[Any, Any]
+
+
+def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec:
+    """What the learner must know of an environment.
+
+    Args:
+        env: any Gymnasium environment with Box observations and bounded Box actions.
+        periodic: coordinates of the (flattened) observation that are angles in rad; None takes
+            ``env.metadata["periodic_coordinates"]`` if it is there.
+
+    Raises:
+        SpaceError: a space that cannot be served, with what to do about it.
+    """
+    observations, actions = env.observation_space, env.action_space
+    if not isinstance(observations, gym.spaces.Box):
+        raise SpaceError(
+            f"the observation space is {observations}, but a Box is needed: states are compared "
+            "by distances; wrap the environment in gymnasium.wrappers.FlattenObservation"
+        )
+    if not isinstance(actions, gym.spaces.Box):
+        raise SpaceError(
+            f"the action space is {actions}, but a Box is needed: the policy is a Gaussian "
+            "process over continuous actions; choose a continuous form of the task, or map a "
+            "Box to these actions with gymnasium.wrappers.TransformAction"
+        )
+    if not actions.is_bounded():
+        raise SpaceError(
+            f"the action space {actions} is unbounded, but the first policy needs limits to "
+            "explore within; set them with gymnasium.wrappers.TransformAction and a bounded Box"
+        )
+    if periodic is None:
+        periodic = (env.metadata or {}).get("periodic_coordinates", ())
+    return TaskSpec(
+        observation_size=int(np.prod(observations.shape)),
+        action_low=actions.low.ravel(),
+        action_high=actions.high.ravel(),
+        periodic=tuple(periodic),
+    )
+
+
+def without_restarts(env: Environment) -> tuple[Environment, float | None]:
+    """The environment inside an outermost `RandomRestart`, and its probability."""
+    if isinstance(env, RandomRestart):
+        return env.env, env.restart_probability
+    if env.has_wrapper_attr("restart_probability"):
+        raise ConfigurationError(
+            "the environment has a RandomRestart below other wrappers; make it the outermost one"
+        )
+    return env, None
+
+
+def batch_model_of(env: Environment) -> BatchModel | None:
+    """The task's vectorised form, unless a wrapper that it knows nothing of stands between."""
+    transparent = (gym.wrappers.PassiveEnvChecker, gym.wrappers.OrderEnforcing)
+    while isinstance(env, transparent):
+        env = env.env
+    return getattr(env, "batch_model", None)
+
+
+def collect(
+    env: Environment,
+    task: TaskSpec,
+    policy: StochasticPolicy,
+    count: int,
+    *,
+    seed: int,
+    iteration: int,
+    restart_probability: float,
+    on_rollout: Callable[[int], None] | None = None,
+) -> list[Rollout]:
+    """``count`` roll-outs of random length, as the paper's protocol collects them.
+
+    Args:
+        on_rollout: called with the number of roll-outs that are complete.
+
+    Raises:
+        EnvironmentFailure: the environment raised.
+        DataError: it returned NaN, infinities or observations of another size.
+    """
+    seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
+    noises = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
+    lengths = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
+    return simulate(env, task, policy, seeds, noises, lengths, on_rollout)
+
+
+def simulate(
+    env: Environment,
+    task: TaskSpec,
+    policy: StochasticPolicy,
+    seeds: Sequence[int],
+    noises: Sequence[np.random.Generator],
+    lengths: Sequence[int],
+    on_rollout: Callable[[int], None] | None = None,
+) -> list[Rollout]:
+    """One roll-out per seed, of at most the given length, with the policy's noise as given."""
+    model = batch_model_of(env)
+    if model is not None:
+        rollouts = _simulate_batch(model, task, policy, seeds, noises, lengths)
+        if on_rollout is not None:
+            on_rollout(len(rollouts))
+        return rollouts
+    rollouts = []
+    for number, (seed, noise, length) in enumerate(zip(seeds, noises, lengths, strict=True)):
+        rollouts.append(_simulate_one(env, task, policy, seed, noise, length, number))
+        if on_rollout is not None:
+            on_rollout(number + 1)
+    return rollouts
+
+
+def _simulate_batch(
+    model: BatchModel,
+    task: TaskSpec,
+    policy: StochasticPolicy,
+    seeds: Sequence[int],
+    noises: Sequence[np.random.Generator],
+    lengths: Sequence[int],
+) -> list[Rollout]:
+    rngs = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
+    ends = np.array(lengths)  # shortened where a roll-out really ends
+    terminated = np.zeros(len(ends), dtype=bool)
+    longest = int(ends.max())
+    observations = np.empty((longest + 1, len(ends), task.observation_size))
+    actions = np.empty((longest, len(ends), task.action_size))
+    rewards = np.empty((longest, len(ends)))
+    observations[0] = model.initial(rngs)
+    for t in range(longest):
+        live = np.flatnonzero(ends > t)
+        if len(live) == 0:
+            break
+        noise = np.array([noises[j].standard_normal(task.action_size) for j in live])
+        actions[t, live] = policy.act(observations[t, live], noise)
+        observations[t + 1, live], rewards[t, live], done = model.step(
+            observations[t, live], task.clip(actions[t, live]), [rngs[j] for j in live]
+        )
+        ends[live[done]] = t + 1
+        terminated[live[done]] = True
+    return [
+        Rollout(observations[: end + 1, j], actions[:end, j], rewards[:end, j], bool(terminated[j]))
+        for j, end in enumerate(ends)
+    ]
+
+
+def _simulate_one(
+    env: Environment,
+    task: TaskSpec,
+    policy: StochasticPolicy,
+    seed: int,
+    noise: np.random.Generator,
+    length: int,
+    number: int,
+) -> Rollout:
+    space = env.action_space
+    observations: list[FloatArray] = []
+    actions: list[FloatArray] = []
+    rewards: list[float] = []
+    terminated = truncated = False
+    try:
+        observation, _ = env.reset(seed=seed)
+        observations.append(_flat(observation))
+        while not (terminated or truncated) and len(rewards) < length:
+            state = observations[-1]
+            if state.shape != (task.observation_size,) or not np.isfinite(state).all():
+                break  # the roll-out's own check will say what is wrong
+            action = policy.act(state[None], noise.standard_normal((1, task.action_size)))[0]
+            applied = task.clip(action).astype(space.dtype).reshape(space.shape or ())
+            observation, reward, terminated, truncated, _ = env.step(applied)
+            observations.append(_flat(observation))
+            actions.append(action)
+            rewards.append(float(reward))
+    except Exception as error:
+        raise EnvironmentFailure(
+            f"the environment raised {type(error).__name__} in roll-out {number}, after "
+            f"{len(rewards)} steps: {error}; what was learnt before is kept, so mend the "
+            "environment and call learn() again"
+        ) from error
+    try:
+        rollout = Rollout(
+            np.stack(observations), np.stack(actions), np.array(rewards), terminated
+        )
+        rollout.check(task)
+    except (ValueError, DataError) as error:
+        raise DataError(f"roll-out {number} of the environment: {error}") from error
+    return rollout
+
+
+def _flat(observation: Any) -> FloatArray:
+    return np.array(observation, dtype=np.float64).ravel()

@@ -1,0 +1,101 @@
+"""Everything that can be chosen about a learner, with its defaults and named recipes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal, get_args
+
+from kreps.errors import ConfigurationError
+
+Model = Literal["embedding", "sample"]
+PolicyFit = Literal["map", "bounded"]
+Exploration = Literal["bang-bang", "gaussian"]
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The parameters of REPS with RKHS embeddings; the defaults are the recipe ``"default"``.
+
+    Attributes:
+        kl_bound: epsilon of Eq. 2 in nats: how far one update may move from the samples.
+        eta_floor: least temperature, in standard deviations of the reward.  Near convergence the
+            optimum of the dual falls to zero and the KL bound would chase noise; a floor lets the
+            bound go slack instead.  0 gives the paper's update.
+        ridge: rho times the number of samples; the softness of the stationarity constraint.
+        model: transition model, ``"embedding"`` (Eq. 4) or ``"sample"`` (the observed successor).
+        policy_fit: ``"map"``, maximum a posteriori hyper-parameters of the policy, or
+            ``"bounded"``, maximum likelihood within hard ranges.
+        exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``.
+        exploration_scale: standard deviation of the Gaussian one, in units of half the range.
+        restart_probability: p; a roll-out lasts (1 - p) / p steps on expectation.
+        initial_rollouts: roll-outs of the first policy.
+        rollouts_per_iteration: roll-outs of the current policy before each later update.
+        window: how many of the latest roll-outs are kept.
+        max_rank: most features of V.
+        basis_tolerance: the basis of V is complete when no state has a larger squared residual.
+    """
+
+    kl_bound: float = 1.0
+    eta_floor: float = 0.1
+    ridge: float = 0.1
+    model: Model = "embedding"
+    policy_fit: PolicyFit = "map"
+    exploration: Exploration = "bang-bang"
+    exploration_scale: float = 1.0
+    restart_probability: float = 0.02
+    initial_rollouts: int = 30
+    rollouts_per_iteration: int = 10
+    window: int = 30
+    max_rank: int = 400
+    basis_tolerance: float = 1e-6
+
+    def __post_init__(self) -> None:
+        for name, kind in (
+            ("model", Model),
+            ("policy_fit", PolicyFit),
+            ("exploration", Exploration),
+        ):
+            if getattr(self, name) not in get_args(kind):
+                raise ConfigurationError(
+                    f"{name} = {getattr(self, name)!r} is unknown; choose one of "
+                    + ", ".join(repr(choice) for choice in get_args(kind))
+                )
+        for name in ("kl_bound", "ridge", "exploration_scale", "basis_tolerance"):
+            _require(name, getattr(self, name), "positive", lambda v: 0 < v < float("inf"))
+        _require("eta_floor", self.eta_floor, "zero or positive", lambda v: 0 <= v < float("inf"))
+        _require("restart_probability", self.restart_probability, "in (0, 1)", lambda v: 0 < v < 1)
+        for name in ("initial_rollouts", "rollouts_per_iteration", "window", "max_rank"):
+            _require(name, getattr(self, name), "a whole number >= 1", lambda v: v >= 1, int)
+
+
+def _require(
+    name: str, value: Any, limit: str, holds: Any, kind: type | tuple[type, ...] = (int, float)
+) -> None:
+    if isinstance(value, bool) or not isinstance(value, kind) or not holds(value):
+        raise ConfigurationError(f"{name} = {value!r}, but it must be {limit}")
+
+
+RECIPES: dict[str, Settings] = {
+    "default": Settings(),
+    "paper": Settings(kl_bound=0.5, eta_floor=0.0, policy_fit="bounded"),
+}
+"""``"paper"`` follows the printed method; docs/deviations.md says what ``"default"`` changes and why."""
+
+
+def settings_of(recipe: str = "default", **changes: Any) -> Settings:
+    """The named recipe with some parameters changed.
+
+    Raises:
+        ConfigurationError: unknown recipe or parameter, or a value out of range.
+    """
+    if recipe not in RECIPES:
+        raise ConfigurationError(
+            f"recipe {recipe!r} is unknown; choose one of {', '.join(map(repr, RECIPES))}"
+        )
+    known = [f.name for f in fields(Settings)]
+    unknown = [name for name in changes if name not in known]
+    if unknown:
+        raise ConfigurationError(
+            f"unknown parameter {', '.join(unknown)}; the parameters are {', '.join(known)}"
+        )
+    return replace(RECIPES[recipe], **changes)
