@@ -61,8 +61,8 @@ def cholesky(a: FloatArray) -> Cholesky:
 
 def solve_lower(lower: FloatArray, b: FloatArray) -> FloatArray:
     """``L^-1 b`` for lower triangular ``L`` (n, n) and ``b`` (n,) or (n, k)."""
-    if b.ndim == 1:
-        return blas.dtrsv(lower, b, lower=1)  # type: ignore[no-any-return]
+    if b.ndim == 1 or b.shape[1] == 1:  # the control loop: no threads, no blocking
+        return blas.dtrsv(lower, b.ravel(), lower=1).reshape(b.shape)  # type: ignore[no-any-return]
     return blas.dtrsm(1.0, lower, b, lower=1)  # type: ignore[no-any-return]
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
-from kreps.kernels import Kernel
+from kreps.kernels import Kernel, gaussian_gram
 from kreps.linalg import cholesky, solve_lower
 
 
@@ -100,8 +101,13 @@ class CostSensitiveGP:
         k = self._covariances(states)
         return self._actions(k.T @ self.alpha + self._spread(k)[:, None] * noise)
 
+    @cached_property
+    def _support_coordinates(self) -> FloatArray:
+        """Embedded once, as the control loop asks for one state at a time."""
+        return self.kernel.embed(self.support)
+
     def _covariances(self, states: FloatArray) -> FloatArray:
-        return self.signal * self.kernel.gram(self.support, states)
+        return self.signal * gaussian_gram(self._support_coordinates, self.kernel.embed(states))
 
     def _spread(self, k: FloatArray) -> FloatArray:
         explained = solve_lower(self.lower, k)

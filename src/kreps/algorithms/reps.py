@@ -19,7 +19,13 @@ from kreps.dual import (
 )
 from kreps.embedding import KernelEmbedding, SampleModel, TransitionModel
 from kreps.errors import DataError
-from kreps.hyperparameters import EmbeddingLoss, PolicyLoss, Prior, factor_distances, minimise
+from kreps.hyperparameters import (
+    EmbeddingLoss,
+    PolicyLoss,
+    Prior,
+    factor_distances,
+    minimise,
+)
 from kreps.kernels import Kernel, SquaredExponential, factors_of, median_lengthscales
 from kreps.policies import CostSensitiveGP
 from kreps.settings import Settings

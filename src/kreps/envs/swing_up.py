@@ -142,6 +142,8 @@ class SwingUp(gym.Env[FloatArray, FloatArray]):
         "render_modes": ["rgb_array"],
         "render_fps": round(1.0 / TIME_STEP),
         "periodic_coordinates": (0,),
+        "observation_labels": ("angle from upright [rad]", "angular velocity [rad/s]"),
+        "action_labels": ("torque [N m]",),
     }
     batch_model = SwingUpBatch()
 

@@ -1,0 +1,260 @@
+"""KREPS: the facade.  Collect roll-outs, update, report, and do it again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kreps import storage
+from kreps.algorithms.reps import LearnerState, UpdateInfo, update
+from kreps.arrays import FloatArray
+from kreps.controller import Policy
+from kreps.data import Rollout, TaskSpec, Window
+from kreps.errors import ConfigurationError, DataError
+from kreps.policies import BangBang, Gaussian, StochasticPolicy
+from kreps.rollout import Environment, collect, task_of, without_restarts
+from kreps.seeding import Purpose, generator
+from kreps.settings import Settings, settings_of
+from kreps.threads import blas_threads
+from kreps.value import ValueFunction
+
+
+@dataclass(frozen=True)
+class IterationReport:
+    """What a callback is told after each iteration.
+
+    Attributes:
+        iteration: updates made, this one included.
+        rollouts, steps: roll-outs and environment steps seen so far.
+        average_reward: per step, over the new roll-outs.
+        update: what the update reports, with CPU seconds by stage.
+        rollout_seconds: CPU seconds that the new roll-outs took.
+    """
+
+    iteration: int
+    rollouts: int
+    steps: int
+    average_reward: float
+    update: UpdateInfo
+    rollout_seconds: float
+
+
+Callback = Callable[["KREPS", IterationReport], bool | None]
+"""Called after each iteration; returning False ends the learning early."""
+
+
+class KREPS:
+    """Relative entropy policy search with RKHS embeddings.
+
+    Args:
+        env: a Gymnasium environment with Box observations and bounded Box actions, or a
+            `TaskSpec` if all data comes through `update`.  The learner restarts it at random as
+            in the paper (Sec. 4.1), so it need not end by itself.
+        seed: of everything random; the same seed gives the same policy, byte for byte.
+        recipe: ``"default"`` or ``"paper"``, the printed method; see `kreps.RECIPES`.
+        periodic: coordinates of the observation that are angles in rad; None asks the
+            environment's ``metadata["periodic_coordinates"]``.
+        threads: BLAS threads while learning; None leaves BLAS as it is.
+        **settings: any field of `kreps.Settings`, such as ``kl_bound``.
+
+    Raises:
+        SpaceError: the environment's spaces cannot be served.
+        ConfigurationError: unknown or impossible settings.
+    """
+
+    def __init__(
+        self,
+        env: Environment | TaskSpec,
+        *,
+        seed: int = 0,
+        recipe: str = "default",
+        periodic: Sequence[int] | None = None,
+        threads: int | None = 1,
+        **settings: Any,
+    ) -> None:
+        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+            raise ConfigurationError(f"seed = {seed!r}, but it must be a whole number >= 0")
+        self.env: Environment | None = None
+        if isinstance(env, TaskSpec):
+            self.task = env
+        else:
+            self.env, restart_probability = without_restarts(env)
+            self.task = task_of(env, periodic)
+            if restart_probability is not None:
+                settings.setdefault("restart_probability", restart_probability)
+        self.settings: Settings = settings_of(recipe, **settings)
+        self.seed = seed
+        self.threads = threads
+        self.state = LearnerState(Window(self.settings.window))
+
+    @property
+    def policy(self) -> Policy:
+        """The policy learnt last.
+
+        Raises:
+            ConfigurationError: nothing has been learnt yet.
+        """
+        if self.state.policy is None:
+            raise ConfigurationError(
+                "no policy has been learnt yet; call learn() or update() first"
+            )
+        return Policy(self.state.policy, self.seed)
+
+    @property
+    def value_function(self) -> ValueFunction:
+        """V of the last update (Eq. 3), in units of the reward.
+
+        Raises:
+            ConfigurationError: nothing has been learnt yet.
+        """
+        if self.state.value is None:
+            raise ConfigurationError("no V has been learnt yet; call learn() or update() first")
+        return self.state.value
+
+    def learn(
+        self,
+        iterations: int = 20,
+        *,
+        callback: Callback | Sequence[Callback] = (),
+        progress: bool = True,
+    ) -> KREPS:
+        """Make ``iterations`` more updates, each from new roll-outs of the current policy.
+
+        Args:
+            iterations: how many.
+            callback: one callable or several, called in order after each iteration.
+            progress: show a live table (in a terminal) or a line per iteration.
+
+        Raises:
+            ConfigurationError: the learner was made without an environment.
+            EnvironmentFailure: the environment raised; the learner is as after the last update.
+            DataError: the environment returned NaN, infinities or wrong shapes; likewise.
+        """
+        if self.env is None:
+            raise ConfigurationError(
+                "this learner was made from a TaskSpec and has no environment to roll out in; "
+                "give it data by update(rollouts), or make it from an environment"
+            )
+        callbacks = [callback] if callable(callback) else list(callback)
+        if progress:
+            from kreps.progress import ProgressTable
+
+            with ProgressTable(self.settings, self.state.iteration + iterations) as table:
+                return self._learn(iterations, [table, *callbacks], table.rollouts_done)
+        return self._learn(iterations, callbacks, None)
+
+    def _learn(
+        self,
+        iterations: int,
+        callbacks: Sequence[Callback],
+        on_rollout: Callable[[int], None] | None,
+    ) -> KREPS:
+        assert self.env is not None
+        for _ in range(iterations):
+            first = self.state.iteration == 0
+            count = self.settings.initial_rollouts if first else self.settings.rollouts_per_iteration
+            started = time.process_time()
+            with blas_threads(self.threads):
+                rollouts = collect(
+                    self.env,
+                    self.task,
+                    self._acting_policy(),
+                    count,
+                    seed=self.seed,
+                    iteration=self.state.iteration,
+                    restart_probability=self.settings.restart_probability,
+                    on_rollout=on_rollout,
+                )
+            seconds = time.process_time() - started
+            info = self.update(rollouts)
+            report = IterationReport(
+                iteration=self.state.iteration,
+                rollouts=self.state.rollouts,
+                steps=self.state.steps,
+                average_reward=float(np.concatenate([r.rewards for r in rollouts]).mean()),
+                update=info,
+                rollout_seconds=seconds,
+            )
+            if any([each(self, report) is False for each in callbacks]):
+                break
+        return self
+
+    def update(self, rollouts: Iterable[Rollout]) -> UpdateInfo:
+        """One update from roll-outs collected anywhere; those kept from before count too.
+
+        Args:
+            rollouts: at least one; their actions as commanded, before any clipping.
+
+        Raises:
+            DataError: not roll-outs, none of them, or of other widths than the task's.
+        """
+        rollouts = list(rollouts)
+        for number, rollout in enumerate(rollouts):
+            if not isinstance(rollout, Rollout):
+                raise DataError(
+                    f"item {number} is a {type(rollout).__name__}, not a kreps.Rollout; build one "
+                    "from observations (T + 1, ds), actions (T, da) and rewards (T,)"
+                )
+        if not rollouts:
+            raise DataError("there is no new roll-out to learn from; give at least one")
+        rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
+        with blas_threads(self.threads):
+            self.state, info = update(self.state, rollouts, self.task, self.settings, rng)
+        return info
+
+    def _acting_policy(self) -> StochasticPolicy:
+        if self.state.policy is not None:
+            return self.state.policy
+        if self.settings.exploration == "bang-bang":
+            return BangBang(self.task)
+        return Gaussian(self.task, self.settings.exploration_scale)
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[FloatArray, Any]:
+        """`Policy.predict` of the current policy."""
+        return self.policy.predict(observation, state, episode_start, deterministic)
+
+    def save(self, path: str | Path) -> None:
+        """Write a checkpoint from which `resume` goes on as if nothing had happened."""
+        storage.save_checkpoint(path, self.state, self.task, self.settings, self.seed)
+
+    @classmethod
+    def resume(cls, path: str | Path, env: Environment | None = None) -> KREPS:
+        """A learner as it was when it was saved; settings and seed come from the file.
+
+        Args:
+            path: written by `save`.
+            env: the environment it learnt in; None if all data comes through `update`.
+
+        Raises:
+            StorageError: the file is missing, damaged or foreign.
+            ConfigurationError: the environment is not of the shape that was learnt in.
+        """
+        state, task, settings, seed = storage.load_checkpoint(path)
+        learner = cls(task, seed=seed)
+        if env is not None:
+            learner.env, _ = without_restarts(env)
+            found = task_of(env, task.periodic)
+            same = found.observation_size == task.observation_size and (
+                np.array_equal(found.action_low, task.action_low)
+                and np.array_equal(found.action_high, task.action_high)
+            )
+            if not same:
+                raise ConfigurationError(
+                    f"the environment has {found.observation_size} observation coordinates and "
+                    f"actions in {found.action_low} to {found.action_high}, the checkpoint "
+                    f"{task.observation_size} and {task.action_low} to {task.action_high}; "
+                    "resume in the environment that it was learnt in"
+                )
+        learner.settings, learner.state = settings, state
+        return learner

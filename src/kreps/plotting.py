@@ -1,0 +1,267 @@
+"""Pictures of a run.  Everything is drawn from what the run wrote; nothing is computed anew but maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import animation, rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+from kreps.algorithms.reps import LearnerState
+from kreps.arrays import FloatArray
+from kreps.data import TaskSpec
+from kreps.errors import ConfigurationError
+
+STYLE = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 10,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "figure.constrained_layout.use": True,
+    "legend.frameon": False,
+    "savefig.dpi": 150,
+}
+BLUE, ORANGE, GREY = "#20639b", "#d1603d", "#8a8d91"
+MAP_POINTS = 121
+
+
+def save(figure: Figure, path: Path) -> Path:
+    FigureCanvasAgg(figure)
+    with rc_context(STYLE):
+        figure.savefig(path)
+    return path
+
+
+def learning_curve(
+    rows: Sequence[Mapping[str, str]],
+    references: Mapping[str, float],
+    evaluation: Mapping[str, Any] | None,
+    title: str,
+) -> Figure:
+    """Average reward against environment steps, above realised KL and effective sample size.
+
+    Args:
+        rows: of ``progress.csv``.
+        references: values to draw as lines, by name.
+        evaluation: of ``evaluation.json``, drawn at the last step.
+        title: of the figure.
+    """
+    steps = np.array([int(row["steps"]) for row in rows])
+    # a batch was collected by the policy learnt from the steps before it
+    known = np.concatenate([[0], steps[:-1]])
+
+    def column(name: str) -> FloatArray:
+        return np.array([float(row[name]) for row in rows])
+
+    with rc_context(STYLE):
+        figure = Figure(figsize=(7.0, 6.0))
+        top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(4, 1, 1))
+        top.plot(known, column("average_reward"), "o-", color=BLUE, ms=4, label="training roll-outs")
+        if evaluation:
+            for name, marker in (("stochastic", "D"), ("greedy", "*")):
+                top.plot(
+                    steps[-1],
+                    evaluation[name]["mean"],
+                    marker,
+                    color=ORANGE,
+                    ms=9 if marker == "*" else 6,
+                    label=f"{name} policy, evaluated: {evaluation[name]['mean']:.4g}",
+                )
+        for name, value in references.items():
+            top.axhline(value, color=GREY, lw=0.8, ls="--")
+            top.annotate(
+                f"{name} {value:g}",
+                (0.995, value),
+                xycoords=("axes fraction", "data"),
+                xytext=(0, 2),
+                textcoords="offset points",
+                ha="right",
+                color=GREY,
+                fontsize=7.5,
+            )
+        top.set_ylabel("average reward per step")
+        top.set_title(title)
+        top.legend(loc="center right")
+        middle.plot(steps, column("kl"), "o-", color=BLUE, ms=3)
+        middle.plot(steps, column("kl_bound"), color=GREY, lw=0.8, ls="--")
+        middle.set_ylabel("KL and bound\n[nats]")
+        middle.set_ylim(bottom=0)
+        bottom.plot(steps, column("effective_samples") / column("samples"), "o-", color=BLUE, ms=3)
+        bottom.set_ylabel("effective\nsample share")
+        bottom.set_ylim(0, 1)
+        bottom.set_xlabel("environment steps seen before")
+    return figure
+
+
+def policy_maps(
+    state: LearnerState, task: TaskSpec, labels: Sequence[str], action_labels: Sequence[str]
+) -> Figure:
+    """Maps of policy mean, policy standard deviation and V over a two-dimensional state space.
+
+    The latest roll-outs are drawn in: away from them the maps are extrapolation.
+
+    Raises:
+        ConfigurationError: the state space has not two dimensions.
+    """
+    assert state.policy is not None and state.value is not None
+    axes_x, axes_y, states = _grid(state, task)
+    low, high = task.action_low[0], task.action_high[0]
+    spread = state.policy.standard_deviation(states)[:, 0]
+    panels = (
+        ("Policy mean", np.clip(state.policy.mean(states)[:, 0], low, high), "RdBu_r", low, high),
+        ("Policy standard deviation", spread, "viridis", 0.0, None),
+        ("Value function V", state.value(states), "magma", None, None),
+    )
+    units = (action_labels[0], action_labels[0], "reward")
+    with rc_context(STYLE):
+        figure = Figure(figsize=(12.5, 3.9))
+        plots = figure.subplots(1, 3, sharey=True)
+        for axes, (name, values, colours, least, most), unit in zip(
+            plots, panels, units, strict=True
+        ):
+            image = _show_map(axes, axes_x, axes_y, values, colours, least, most)
+            _draw_trajectories(axes, state, task)
+            _label_axes(axes, task, labels)
+            axes.set_title(name)
+            figure.colorbar(image, ax=axes, label=unit, pad=0.02)
+        for axes in plots[1:]:
+            axes.set_ylabel("")
+    return figure
+
+
+def film(
+    frames: Sequence[Any],
+    observations: FloatArray,
+    actions: FloatArray,
+    state: LearnerState,
+    task: TaskSpec,
+    labels: Sequence[str],
+    action_labels: Sequence[str],
+    fps: float,
+    path: Path,
+) -> Path:
+    """A roll-out as GIF or MP4: what the camera sees and, for two-dimensional states, the path.
+
+    Args:
+        frames: T pictures (height, width, 3).
+        observations: (T, ds) and actions (T, da) that go with them.
+        path: ending in ``.gif``, or ``.mp4`` where ffmpeg is installed.
+
+    Raises:
+        ConfigurationError: another ending, or no ffmpeg.
+    """
+    writer = _writer(path, fps)
+    plane = task.observation_size == 2
+    with rc_context({**STYLE, "figure.constrained_layout.use": False}):
+        figure = Figure(figsize=(7.6 if plane else 3.8, 3.6), dpi=80)
+        FigureCanvasAgg(figure)
+        camera = figure.add_axes((0.01, 0.02, 0.46 if plane else 0.98, 0.86))
+        camera.set_axis_off()
+        picture = camera.imshow(frames[0])
+        text = figure.text(0.02, 0.92, "", family="monospace", fontsize=8)
+        if plane:
+            axes = figure.add_axes((0.57, 0.15, 0.40, 0.73))
+            x, y, states = _grid(state, task)
+            assert state.policy is not None
+            mean = np.clip(
+                state.policy.mean(states)[:, 0], task.action_low[0], task.action_high[0]
+            )
+            _show_map(axes, x, y, mean, "RdBu_r", task.action_low[0], task.action_high[0])
+            _label_axes(axes, task, labels)
+            axes.set_title("policy mean and path", fontsize=8)
+            (trail,) = axes.plot([], [], color="black", lw=1.2)
+            (dot,) = axes.plot([], [], "o", color="black", ms=6)
+
+        def draw(t: int) -> list[Any]:
+            picture.set_data(frames[t])
+            text.set_text(f"t = {t / fps:5.2f} s   {action_labels[0]} {actions[t, 0]:7.2f}")
+            if plane:
+                trail.set_data(*_unwrapped(observations[: t + 1], task))
+                dot.set_data(observations[t : t + 1, 0], observations[t : t + 1, 1])
+            return []
+
+        animation.FuncAnimation(figure, draw, frames=len(frames)).save(path, writer=writer)
+    return path
+
+
+def _writer(path: Path, fps: float) -> animation.AbstractMovieWriter:
+    if path.suffix == ".gif":
+        return animation.PillowWriter(fps=round(fps))
+    if path.suffix == ".mp4":
+        if not animation.FFMpegWriter.isAvailable():
+            raise ConfigurationError("an .mp4 needs ffmpeg, which is not installed; choose a .gif")
+        return animation.FFMpegWriter(fps=round(fps))
+    raise ConfigurationError(f"{path.name!r} is no film; end its name in .gif or .mp4")
+
+
+def _grid(state: LearnerState, task: TaskSpec) -> tuple[FloatArray, FloatArray, FloatArray]:
+    if task.observation_size != 2:
+        raise ConfigurationError(
+            f"maps need a two-dimensional state space, this one has {task.observation_size}"
+        )
+    points = state.window.transitions.points
+    axes = []
+    for i in range(2):
+        low, high = points[:, i].min(), points[:, i].max()
+        if i in task.periodic:  # a whole turn, cut where the task cuts it
+            middle = 0.5 * (low + high)
+            low, high = middle - np.pi, middle + np.pi
+            low, high = round(low / (np.pi / 4)) * np.pi / 4, round(high / (np.pi / 4)) * np.pi / 4
+        axes.append(np.linspace(low, high, MAP_POINTS))
+    x, y = np.meshgrid(*axes)
+    return axes[0], axes[1], np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def _show_map(
+    axes: Axes,
+    x: FloatArray,
+    y: FloatArray,
+    values: FloatArray,
+    colours: str,
+    least: float | None,
+    most: float | None,
+) -> Any:
+    return axes.imshow(
+        values.reshape(len(y), len(x)),
+        origin="lower",
+        aspect="auto",
+        extent=(x[0], x[-1], y[0], y[-1]),
+        cmap=colours,
+        vmin=least,
+        vmax=most,
+        interpolation="bilinear",
+    )
+
+
+def _draw_trajectories(axes: Axes, state: LearnerState, task: TaskSpec, count: int = 10) -> None:
+    limits = axes.axis()
+    for rollout in state.window.rollouts[-count:]:
+        axes.plot(*_unwrapped(rollout.observations, task), color="white", lw=1.6, alpha=0.5)
+        axes.plot(*_unwrapped(rollout.observations, task), color="black", lw=0.7, alpha=0.8)
+    axes.axis(limits)
+
+
+def _unwrapped(observations: FloatArray, task: TaskSpec) -> FloatArray:
+    """The path (2, m) with a gap wherever an angle jumps across its cut."""
+    path = observations[:, :2]
+    angles = [i for i in task.periodic if i < 2]
+    jumps = np.flatnonzero((np.abs(np.diff(path[:, angles], axis=0)) > np.pi).any(axis=1)) + 1
+    return np.insert(path, jumps, np.nan, axis=0).T
+
+
+def _label_axes(axes: Axes, task: TaskSpec, labels: Sequence[str]) -> None:
+    axes.set_xlabel(labels[0])
+    axes.set_ylabel(labels[1])
+    if 0 in task.periodic:
+        ticks = np.arange(-4, 5) * np.pi / 2
+        names = ["-2π", "-3π/2", "-π", "-π/2", "0", "π/2", "π", "3π/2", "2π"]
+        low, high = axes.get_xlim()
+        inside = [i for i, t in enumerate(ticks) if low - 1e-9 <= t <= high + 1e-9]
+        axes.set_xticks(ticks[inside], [names[i] for i in inside])

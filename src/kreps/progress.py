@@ -1,0 +1,107 @@
+"""The live progress display of `KREPS.learn`: a table in a terminal, plain lines elsewhere."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import TYPE_CHECKING
+
+from rich.console import Console
+from rich.live import Live
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+from kreps.settings import Settings
+
+if TYPE_CHECKING:
+    from kreps.learner import KREPS, IterationReport
+
+COLUMNS = ("iter", "steps", "reward", "KL / bound", "eta", "ESS", "gap", "CPU s")
+SHOWN_ROWS = 24
+
+
+def seconds_by_stage(report: IterationReport) -> dict[str, float]:
+    """CPU seconds of one iteration, roll-outs included."""
+    return {"rollouts": report.rollout_seconds, **report.update.seconds}
+
+
+class ProgressTable:
+    """A callback that shows each iteration as a row, and the time that is left."""
+
+    def __init__(self, settings: Settings, target: int) -> None:
+        self._settings = settings
+        self._console = Console()
+        self._rows: list[tuple[str, ...]] = []
+        self._stages: dict[str, float] = {}
+        self._bar = Progress(
+            TextColumn("learning"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeRemainingColumn(),
+            TextColumn("{task.fields[note]}"),
+            console=self._console,
+        )
+        self._task = self._bar.add_task("learning", total=target, note="")
+        self._live = Live(self._layout(), console=self._console, refresh_per_second=4)
+
+    def __enter__(self) -> ProgressTable:
+        if self._console.is_terminal:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self._console.is_terminal:
+            self._bar.update(self._task, note="")
+            self._live.update(self._layout(), refresh=True)
+            self._live.stop()
+
+    def rollouts_done(self, count: int) -> None:
+        self._bar.update(self._task, note=f"{count} roll-outs")
+
+    def __call__(self, learner: KREPS, report: IterationReport) -> None:
+        dual = report.update.dual
+        stages = seconds_by_stage(report)
+        for name, seconds in stages.items():
+            self._stages[name] = self._stages.get(name, 0.0) + seconds
+        row = (
+            f"{report.iteration}",
+            f"{report.steps}",
+            f"{report.average_reward:.4g}",
+            f"{dual.kl:.3f} / {self._settings.kl_bound:g}",
+            f"{dual.eta:.3g}",
+            f"{report.update.effective_samples:.0f}",
+            f"{dual.gap:.0e}",
+            f"{sum(stages.values()):.2f}",
+        )
+        if self._console.is_terminal:
+            self._rows.append(row)
+            self._bar.update(self._task, completed=report.iteration)
+            self._live.update(self._layout())
+        else:
+            pairs = zip(COLUMNS, row, strict=True)
+            print("  ".join(f"{name} {value}" for name, value in pairs), flush=True)
+
+    def _layout(self) -> Table:
+        table = Table(box=None, pad_edge=False)
+        for name in COLUMNS:
+            table.add_column(name, justify="right")
+        for row in self._rows[-SHOWN_ROWS:]:
+            table.add_row(*row)
+        whole = Table.grid()
+        whole.add_row(table)
+        if self._stages:
+            total = sum(self._stages.values())
+            shares = ", ".join(f"{name} {s / total:.0%}" for name, s in self._stages.items())
+            whole.add_row(f"[dim]CPU {total:.1f} s: {shares}[/dim]")
+        whole.add_row(self._bar)
+        return whole

@@ -1,0 +1,183 @@
+"""A run folder: what was asked for, how it went, and everything needed to go on.
+
+``config.json`` is written once; after each iteration ``progress.csv``, ``policy.safetensors`` and
+then ``checkpoint.safetensors`` are replaced, each atomically.  The checkpoint is what counts: the
+others are never behind it, and rows ahead of it are dropped on resuming.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import platform
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy
+
+from kreps.errors import ConfigurationError, StorageError
+from kreps.learner import KREPS, IterationReport
+from kreps.progress import seconds_by_stage
+from kreps.storage import save_policy, write_atomically
+
+STAGES = (
+    "rollouts",
+    "basis",
+    "embedding fit",
+    "embedding",
+    "dual",
+    "policy fit",
+    "policy",
+)
+COLUMNS = (
+    "iteration",
+    "rollouts",
+    "steps",
+    "average_reward",
+    "kl",
+    "kl_bound",
+    "eta",
+    "effective_samples",
+    "samples",
+    "rank",
+    "support",
+    "dual",
+    "primal",
+    "gap",
+    "decrement",
+    "stationarity",
+    "newton_iterations",
+    "outcome",
+    "jitter",
+    *(f"cpu_seconds_{stage.replace(' ', '_')}" for stage in STAGES),
+)
+
+
+@dataclass(frozen=True)
+class RunConfig:
+    """What a run was asked to do; enough to make its environment again.
+
+    Attributes:
+        environment: Gymnasium name.
+        iterations: updates to make in all.
+        seed, recipe, settings: as given to `KREPS`; ``settings`` holds only what was changed.
+        periodic: as given to `KREPS`.
+    """
+
+    environment: str
+    iterations: int
+    seed: int
+    recipe: str
+    settings: dict[str, Any]
+    periodic: list[int] | None
+
+
+def versions() -> dict[str, str]:
+    """What the numbers depend on beyond the configuration."""
+    return {
+        "kreps": version("kreps"),
+        "numpy": np.__version__,
+        "scipy": scipy.__version__,
+        "python": platform.python_version(),
+    }
+
+
+class RunFolder:
+    """The files of one run."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.config_file = self.path / "config.json"
+        self.progress_file = self.path / "progress.csv"
+        self.checkpoint_file = self.path / "checkpoint.safetensors"
+        self.policy_file = self.path / "policy.safetensors"
+        self.evaluation_file = self.path / "evaluation.json"
+
+    def create(self, config: RunConfig) -> None:
+        """Start a run here.
+
+        Raises:
+            ConfigurationError: there is one already.
+        """
+        if self.config_file.exists():
+            raise ConfigurationError(
+                f"{self.path} holds a run already; go on with `kreps resume {self.path}`, "
+                "remove it, or choose another folder"
+            )
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"cannot make the folder {self.path}: {error}") from error
+        content = {**vars(config), "versions": versions()}
+        write_atomically(self.config_file, (json.dumps(content, indent=2) + "\n").encode())
+
+    def config(self) -> RunConfig:
+        """Raises `StorageError` if this is not a run folder."""
+        try:
+            content = json.loads(self.config_file.read_text())
+            content.pop("versions", None)
+            config = RunConfig(**content)
+            types = {"environment": str, "iterations": int, "seed": int, "settings": dict}
+            for name, kind in types.items():
+                if not isinstance(getattr(config, name), kind):
+                    raise TypeError(f"{name} is not a {kind.__name__}")
+        except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
+            raise StorageError(
+                f"{self.path} is not a run folder with an intact config.json ({error}); "
+                "start a run with `kreps train`"
+            ) from error
+        return config
+
+    def rows(self) -> list[dict[str, str]]:
+        """What ``progress.csv`` holds, a dictionary a row; empty if there is none."""
+        try:
+            with open(self.progress_file, newline="") as file:
+                return [row for row in csv.DictReader(file) if None not in row.values()]
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError, csv.Error) as error:
+            raise StorageError(f"cannot read {self.progress_file}: {error}") from error
+
+    def __call__(self, learner: KREPS, report: IterationReport) -> None:
+        """As a callback of `KREPS.learn`: keep what was learnt."""
+        before = [row for row in self.rows() if int(row["iteration"]) < report.iteration]
+        text = io.StringIO()
+        writer = csv.DictWriter(text, COLUMNS, lineterminator="\n", extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows([*before, progress_row(learner, report)])
+        write_atomically(self.progress_file, text.getvalue().encode())
+        assert learner.state.policy is not None
+        save_policy(learner.state.policy, self.policy_file)
+        learner.save(self.checkpoint_file)
+
+
+def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
+    """One row of ``progress.csv``."""
+    info, dual = report.update, report.update.dual
+    seconds = seconds_by_stage(report)
+    return {
+        "iteration": report.iteration,
+        "rollouts": report.rollouts,
+        "steps": report.steps,
+        "average_reward": report.average_reward,
+        "kl": dual.kl,
+        "kl_bound": learner.settings.kl_bound,
+        "eta": dual.eta,
+        "effective_samples": info.effective_samples,
+        "samples": info.samples,
+        "rank": info.rank,
+        "support": info.support,
+        "dual": dual.dual,
+        "primal": dual.primal,
+        "gap": dual.gap,
+        "decrement": dual.decrement,
+        "stationarity": dual.stationarity,
+        "newton_iterations": dual.iterations,
+        "outcome": dual.outcome.name,
+        "jitter": info.jitter,
+        **{f"cpu_seconds_{s.replace(' ', '_')}": round(seconds.get(s, 0.0), 5) for s in STAGES},
+    }

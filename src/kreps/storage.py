@@ -1,0 +1,343 @@
+"""Policies and checkpoints as files: named float64 arrays (safetensors) and one JSON header.
+
+Reading trusts nothing: a file is checked for kind, version, size, names, shapes and finite values
+before it is used, and whatever is wrong with it comes out as `StorageError`.  Writing is
+atomic: a reader, or a run killed at any moment, sees the old file or the new one.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from kreps.algorithms.reps import LearnerState
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec, Window
+from kreps.errors import KrepsError, StorageError
+from kreps.kernels import Kernel, factors_of
+from kreps.policies import CostSensitiveGP
+from kreps.settings import Settings
+from kreps.value import ValueFunction
+
+VERSION = 1
+MAX_FILE_BYTES = 2**31
+MAX_HEADER_BYTES = 2**18
+
+Tensors = dict[str, FloatArray]
+Header = dict[str, Any]
+
+
+# ---- files ------------------------------------------------------------------------------------
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace the file as a whole; the directory must exist."""
+    beside = path.with_name(f".{path.name}.part")
+    try:
+        with open(beside, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(beside, path)
+    except OSError as error:
+        raise StorageError(f"cannot write {path}: {error}; check the folder and its space") from error
+
+
+def write_arrays(path: Path, kind: str, tensors: Tensors, header: Header) -> None:
+    """Write arrays and a JSON header; the same content gives the same bytes."""
+    text = json.dumps({"kind": kind, "version": VERSION, **header}, sort_keys=True)
+    arrays = {name: np.ascontiguousarray(tensors[name]) for name in sorted(tensors)}
+    write_atomically(path, safetensors.numpy.save(arrays, metadata={"kreps": text}))
+
+
+def read_arrays(path: Path, kind: str) -> tuple[Tensors, Header]:
+    """Read what `write_arrays` wrote.
+
+    Raises:
+        StorageError: missing, unreadable, damaged, too large, of another kind or version, or
+            holding anything but finite float64 arrays.
+    """
+    try:
+        if not path.is_file():
+            raise StorageError(f"{path} is not a file; check the path")
+        _check_size(path)
+        with safetensors.safe_open(path, framework="numpy") as file:
+            header = _header(file.metadata(), kind)
+            names = list(file.keys())
+            foreign = [n for n in names if file.get_slice(n).get_dtype() != "F64"]
+            if foreign:
+                raise StorageError(f"array {foreign[0]!r} is not of 64-bit floats")
+            tensors = {n: np.asarray(file.get_tensor(n)) for n in names}
+    except StorageError as error:
+        raise StorageError(f"cannot read {path} as a kreps {kind}: {error}") from error
+    except (OSError, ValueError, TypeError, safetensors.SafetensorError, RecursionError) as error:
+        raise StorageError(
+            f"cannot read {path} as a kreps {kind}: {error}; "
+            "the file is damaged or comes from another program"
+        ) from error
+    for name, values in tensors.items():
+        if not np.isfinite(values).all():
+            raise StorageError(f"{path} holds NaN or infinities in {name!r}: it is damaged")
+    return tensors, header
+
+
+def _check_size(path: Path) -> None:
+    """Bound what the reader may allocate before it parses anything."""
+    size = path.stat().st_size
+    if size > MAX_FILE_BYTES:
+        raise StorageError(f"it has {size} bytes, the limit is {MAX_FILE_BYTES}")
+    with open(path, "rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+    if size < 8 or length > min(MAX_HEADER_BYTES, size - 8):
+        raise StorageError(
+            f"its header would have {length} bytes, the limit is {MAX_HEADER_BYTES} "
+            f"in a file of {size}; it is damaged or not a safetensors file"
+        )
+
+
+def _header(metadata: dict[str, str] | None, kind: str) -> Header:
+    header = json.loads((metadata or {}).get("kreps", "null"))
+    if not isinstance(header, dict) or "kind" not in header:
+        raise StorageError("it has no kreps header: it comes from another program")
+    if header["kind"] != kind:
+        raise StorageError(f"it is a kreps {header['kind']!s:.40}")
+    if header.get("version") != VERSION:
+        raise StorageError(
+            f"it has format version {header.get('version')!s:.20}, this release reads {VERSION}; "
+            "read it with the release that wrote it"
+        )
+    return header
+
+
+def _take(tensors: Tensors, shapes: dict[str, tuple[str | int, ...]], **sizes: int) -> Tensors:
+    """The named arrays, after all letters in their shapes have been matched with each other."""
+    for name, shape in shapes.items():
+        if name not in tensors:
+            raise StorageError(f"array {name!r} is missing")
+        found = tensors[name].shape
+        matches = len(found) == len(shape) and all(
+            size == (sizes.setdefault(letter, size) if isinstance(letter, str) else letter)
+            for letter, size in zip(shape, found, strict=True)
+        )
+        if not matches:
+            raise StorageError(f"array {name!r} has shape {found}, but {shape} is needed")
+    return {name: tensors[name] for name in shapes}
+
+
+# ---- parts ------------------------------------------------------------------------------------
+
+
+def _task_header(task: TaskSpec) -> Header:
+    return {
+        "observation_size": task.observation_size,
+        "action_low": task.action_low.tolist(),
+        "action_high": task.action_high.tolist(),
+        "periodic": list(task.periodic),
+    }
+
+
+def _task_of(header: Header) -> TaskSpec:
+    fields = header["task"]
+    return TaskSpec(
+        int(fields["observation_size"]),
+        fields["action_low"],
+        fields["action_high"],
+        tuple(fields["periodic"]),
+    )
+
+
+def _state_kernel(task: TaskSpec, lengthscales: FloatArray) -> Kernel:
+    if not (lengthscales > 0).all():
+        raise StorageError(f"lengthscales {lengthscales} are not all positive")
+    return Kernel(factors_of(task.observation_size, task.periodic), lengthscales)
+
+
+def _policy_parts(policy: CostSensitiveGP) -> Tensors:
+    return {
+        "policy.lengthscales": policy.kernel.lengthscales,
+        "policy.support": policy.support,
+        "policy.alpha": policy.alpha,
+        "policy.lower": policy.lower,
+        "policy.signal_noise_jitter": np.array([policy.signal, policy.noise, policy.jitter]),
+    }
+
+
+def _policy_of(tensors: Tensors, task: TaskSpec) -> CostSensitiveGP:
+    t = _take(
+        tensors,
+        {
+            "policy.lengthscales": ("factors",),
+            "policy.support": ("m", "ds"),
+            "policy.alpha": ("m", "da"),
+            "policy.lower": ("m", "m"),
+            "policy.signal_noise_jitter": (3,),
+        },
+        factors=task.observation_size,
+        ds=task.observation_size,
+        da=task.action_size,
+    )
+    signal, noise, jitter = t["policy.signal_noise_jitter"].tolist()
+    if len(t["policy.support"]) == 0 or signal <= 0 or noise <= 0:
+        raise StorageError("the policy has no support point or a variance that is not positive")
+    return CostSensitiveGP(
+        task=task,
+        kernel=_state_kernel(task, t["policy.lengthscales"]),
+        support=t["policy.support"],
+        alpha=t["policy.alpha"],
+        lower=np.asfortranarray(t["policy.lower"]),
+        signal=signal,
+        noise=noise,
+        jitter=jitter,
+    )
+
+
+def _value_parts(value: ValueFunction) -> Tensors:
+    return {
+        "value.lengthscales": value.kernel.lengthscales,
+        "value.centres": value.centres,
+        "value.alpha": value.alpha,
+    }
+
+
+def _value_of(tensors: Tensors, task: TaskSpec) -> ValueFunction:
+    t = _take(
+        tensors,
+        {
+            "value.lengthscales": ("factors",),
+            "value.centres": ("r", "ds"),
+            "value.alpha": ("r",),
+        },
+        factors=task.observation_size,
+        ds=task.observation_size,
+    )
+    kernel = _state_kernel(task, t["value.lengthscales"])
+    return ValueFunction(kernel, t["value.centres"], t["value.alpha"])
+
+
+def _window_parts(window: Window) -> Tensors:
+    rollouts = window.rollouts
+    return {
+        "window.lengths": np.array([len(r) for r in rollouts], dtype=np.float64),
+        "window.terminated": np.array([r.terminated for r in rollouts], dtype=np.float64),
+        "window.observations": np.concatenate([r.observations for r in rollouts]),
+        "window.actions": np.concatenate([r.actions for r in rollouts]),
+        "window.rewards": np.concatenate([r.rewards for r in rollouts]),
+    }
+
+
+def _window_of(tensors: Tensors, task: TaskSpec, capacity: int) -> Window:
+    t = _take(
+        tensors,
+        {
+            "window.lengths": ("R",),
+            "window.terminated": ("R",),
+            "window.observations": ("points", "ds"),
+            "window.actions": ("n", "da"),
+            "window.rewards": ("n",),
+        },
+        ds=task.observation_size,
+        da=task.action_size,
+    )
+    lengths, n = t["window.lengths"], len(t["window.rewards"])
+    whole = (lengths >= 1).all() and (lengths <= n).all() and (lengths % 1 == 0).all()
+    if not whole or lengths.sum() != n or len(t["window.observations"]) != n + len(lengths):
+        raise StorageError("the lengths of its roll-outs do not fit their data")
+    cuts = np.cumsum(lengths).astype(int)[:-1]
+    observations = np.split(t["window.observations"], cuts + np.arange(1, len(lengths)))
+    actions = np.split(t["window.actions"], cuts)
+    rewards = np.split(t["window.rewards"], cuts)
+    rollouts = [
+        Rollout(o, a, r, bool(end))
+        for o, a, r, end in zip(observations, actions, rewards, t["window.terminated"], strict=True)
+    ]
+    return Window(capacity).extend(rollouts)
+
+
+# ---- policies and checkpoints -----------------------------------------------------------------
+
+
+def save_policy(policy: CostSensitiveGP, path: str | Path) -> None:
+    write_arrays(Path(path), "policy", _policy_parts(policy), {"task": _task_header(policy.task)})
+
+
+def load_policy(path: str | Path) -> CostSensitiveGP:
+    """Raises `StorageError` if the file is not an intact policy."""
+    tensors, header = read_arrays(Path(path), "policy")
+    try:
+        return _policy_of(tensors, _task_of(header))
+    except (KrepsError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise _inconsistent(path, "policy", error) from error
+
+
+def save_checkpoint(
+    path: str | Path, state: LearnerState, task: TaskSpec, settings: Settings, seed: int
+) -> None:
+    """Everything that a learner needs to go on exactly where it stands.
+
+    No generator state is among it, because none exists: see `kreps.seeding`.
+    """
+    tensors: Tensors = {}
+    if state.window.rollouts:
+        tensors |= _window_parts(state.window)
+    if state.policy is not None and state.value is not None and state.policy_start is not None:
+        tensors |= _policy_parts(state.policy) | _value_parts(state.value)
+        tensors["start.policy"] = state.policy_start
+    if state.embedding_start is not None:
+        tensors["start.embedding"] = state.embedding_start
+    header = {
+        "task": _task_header(task),
+        "settings": asdict(settings),
+        "seed": seed,
+        "iteration": state.iteration,
+        "rollouts": state.rollouts,
+        "steps": state.steps,
+    }
+    write_arrays(Path(path), "checkpoint", tensors, header)
+
+
+def load_checkpoint(path: str | Path) -> tuple[LearnerState, TaskSpec, Settings, int]:
+    """State, task, settings and seed.  Raises `StorageError` if the file is not intact."""
+    tensors, header = read_arrays(Path(path), "checkpoint")
+    try:
+        task = _task_of(header)
+        settings = Settings(**header["settings"])
+        counts = [header[name] for name in ("seed", "iteration", "rollouts", "steps")]
+        if not all(isinstance(count, int) and count >= 0 for count in counts):
+            raise StorageError(f"seed and counts {counts} are not all whole numbers >= 0")
+        seed, iteration, rollouts, steps = counts
+        window = Window(settings.window)
+        if "window.lengths" in tensors:
+            window = _window_of(tensors, task, settings.window)
+        learnt = iteration > 0
+        g = task.observation_size
+        state = LearnerState(
+            window=window,
+            iteration=iteration,
+            rollouts=rollouts,
+            steps=steps,
+            policy=_policy_of(tensors, task) if learnt else None,
+            value=_value_of(tensors, task) if learnt else None,
+            embedding_start=(
+                _take(tensors, {"start.embedding": (g + task.action_size + 1,)})["start.embedding"]
+                if "start.embedding" in tensors
+                else None
+            ),
+            policy_start=(
+                _take(tensors, {"start.policy": (g + 2,)})["start.policy"] if learnt else None
+            ),
+        )
+    except (KrepsError, KeyError, TypeError, ValueError, OverflowError) as error:
+        raise _inconsistent(path, "checkpoint", error) from error
+    return state, task, settings, seed
+
+
+def _inconsistent(path: str | Path, kind: str, error: Exception) -> StorageError:
+    what = f"{type(error).__name__}: {error}" if not isinstance(error, KrepsError) else str(error)
+    return StorageError(f"{path} is a damaged or forged kreps {kind}: {what}")

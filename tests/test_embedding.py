@@ -1,0 +1,100 @@
+"""Eq. 4 against brute force, and against the truth of a small stochastic system."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kreps.arrays import FloatArray
+from kreps.embedding import KernelEmbedding, SampleModel
+from kreps.kernels import Kernel, Periodic, SquaredExponential, factors_of
+
+
+def fitted(n: int, seed: int, regulariser: float) -> tuple[KernelEmbedding, FloatArray]:
+    """An embedding over an angle, a velocity and an action, and features of n successors."""
+    rng = np.random.default_rng(seed)
+    inputs = np.column_stack(
+        [rng.uniform(-np.pi, np.pi, n), rng.normal(size=n), rng.uniform(-1, 1, n)]
+    )
+    factors = (Periodic((0,)), SquaredExponential((1,)), SquaredExponential((2,)))
+    kernel = Kernel(factors, np.array([0.8, 1.2, 0.9]))
+    return KernelEmbedding.fit(kernel, inputs, regulariser), rng.normal(size=(n, 6))
+
+
+@pytest.mark.parametrize("regulariser", [1e-3, 0.1, 1.0])
+def test_strengths_solve_the_regularised_system(regulariser: float) -> None:
+    model, _ = fitted(40, 0, regulariser)
+    queries = np.random.default_rng(1).normal(size=(7, 3))
+    gram = model.kernel.gram(model.inputs) + regulariser * np.eye(40)
+    wanted = np.linalg.solve(gram, model.kernel.gram(model.inputs, queries))
+    np.testing.assert_allclose(model.strengths(queries), wanted, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("regulariser", [1e-3, 0.1, 1.0])
+def test_expected_features_are_the_combination_with_those_strengths(regulariser: float) -> None:
+    model, successors = fitted(40, 2, regulariser)
+    combined = model.strengths(model.inputs).T @ successors
+    np.testing.assert_allclose(model.expected_features(successors), combined, atol=1e-9)
+
+
+def test_expected_features_equal_brute_force() -> None:
+    model, successors = fitted(60, 3, 0.05)
+    k = model.kernel.gram(model.inputs)
+    wanted = k @ np.linalg.inv(k + 0.05 * np.eye(60)) @ successors
+    np.testing.assert_allclose(model.expected_features(successors), wanted, atol=1e-9)
+    assert model.factor.jitter == 0.0
+
+
+def test_expected_features_leave_the_observed_ones_alone() -> None:
+    model, successors = fitted(20, 4, 0.1)
+    before = successors.copy()
+    model.expected_features(successors)
+    np.testing.assert_array_equal(successors, before)
+
+
+def test_one_sample_is_shrunk_by_the_regulariser() -> None:
+    kernel = Kernel(factors_of(1), np.array([1.0]))
+    model = KernelEmbedding.fit(kernel, np.array([[0.0]]), 0.25)
+    found = model.expected_features(np.array([[2.0, -1.0]]))
+    np.testing.assert_allclose(found, [[2.0 / 1.25, -1.0 / 1.25]])
+
+
+def test_duplicated_inputs_share_the_mean_of_their_successors() -> None:
+    kernel = Kernel(factors_of(1), np.array([1.0]))
+    model = KernelEmbedding.fit(kernel, np.zeros((4, 1)), 1e-6)
+    found = model.expected_features(np.array([[0.0], [2.0], [4.0], [6.0]]))
+    np.testing.assert_allclose(found, 3.0, rtol=1e-5)
+
+
+def test_the_sample_model_answers_with_what_was_observed() -> None:
+    successors = np.random.default_rng(5).normal(size=(9, 4))
+    np.testing.assert_array_equal(SampleModel().expected_features(successors), successors)
+
+
+def test_the_conditional_expectation_is_learnt_from_noisy_successors() -> None:
+    """``s' = sin(2 s) + a + noise``: means of s' and s'^2, known in closed form."""
+
+    def errors(n: int) -> tuple[float, float, float]:
+        rng = np.random.default_rng(6)
+        s, a = rng.uniform(-2, 2, n), rng.uniform(-1, 1, n)
+        mean = np.sin(2.0 * s) + a
+        successor = mean + rng.normal(0.0, 0.5, n)
+        observed = np.column_stack([successor, successor**2])
+        truth = np.column_stack([mean, mean**2 + 0.25])
+        inputs = np.column_stack([s, a])
+        model = KernelEmbedding.fit(Kernel(factors_of(2), np.array([0.6, 1.0])), inputs, 0.5)
+        # New inputs well inside the data, where the truth is in reach.
+        query = np.column_stack([rng.uniform(-1.5, 1.5, 200), rng.uniform(-0.8, 0.8, 200)])
+        there = np.sin(2.0 * query[:, 0]) + query[:, 1]
+        predicted = model.strengths(query).T @ observed
+        return (
+            float(np.mean((model.expected_features(observed) - truth) ** 2)),
+            float(np.mean((predicted - np.column_stack([there, there**2 + 0.25])) ** 2)),
+            float(np.mean((SampleModel().expected_features(observed) - truth) ** 2)),
+        )
+
+    few, some, many = errors(40), errors(200), errors(1000)
+    # Measured: 0.43, 0.12, 0.026 at the samples; the observed successors stay at the noise.
+    assert few[0] > 2.0 * some[0] > 4.0 * many[0]
+    assert few[1] > 2.0 * some[1] > 4.0 * many[1]
+    assert many[0] < 0.1 * many[2]

@@ -1,0 +1,137 @@
+"""The cost-sensitive Gaussian process, and the first policies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kreps.arrays import FloatArray
+from kreps.data import TaskSpec
+from kreps.kernels import Kernel, factors_of
+from kreps.policies import BangBang, CostSensitiveGP, Gaussian
+
+TASK = TaskSpec(2, np.array([-1.0, 10.0]), np.array([1.0, 30.0]))
+KERNEL = Kernel(factors_of(2), np.array([0.8, 1.3]))
+SIGNAL, NOISE = 0.7, 0.2
+
+
+def samples(n: int, seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """States, targets in units of the action scale, weights below and above one."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(n, 2)), rng.normal(size=(n, 2)), rng.uniform(0.1, 4.0, size=n)
+
+
+def fit(
+    states: FloatArray, targets: FloatArray, weights: FloatArray, task: TaskSpec = TASK
+) -> CostSensitiveGP:
+    return CostSensitiveGP.fit(task, KERNEL, states, targets, weights, SIGNAL, NOISE)
+
+
+def test_mean_and_deviation_are_those_of_the_equations() -> None:
+    states, targets, weights = samples(25, 0)
+    policy = fit(states, targets, weights)
+    query = np.random.default_rng(1).normal(size=(8, 2))
+    c = SIGNAL * KERNEL.gram(states) + NOISE * np.diag(1.0 / weights)
+    k = SIGNAL * KERNEL.gram(states, query)
+    mean = k.T @ np.linalg.solve(c, targets)
+    variance = SIGNAL - np.einsum("ij,ij->j", k, np.linalg.solve(c, k)) + NOISE
+    centre, scale = np.array([0.0, 20.0]), np.array([1.0, 10.0])
+    np.testing.assert_allclose(policy.mean(query), centre + scale * mean, rtol=1e-9)
+    np.testing.assert_allclose(
+        policy.standard_deviation(query), scale * np.sqrt(variance)[:, None], rtol=1e-9
+    )
+    assert policy.jitter == 0.0
+
+
+def test_a_sample_of_weight_three_counts_as_three_samples() -> None:
+    states, targets, _ = samples(15, 2)
+    weights = np.random.default_rng(3).integers(1, 5, size=15)
+    weighted = fit(states, targets, weights.astype(np.float64))
+    rows = np.repeat(np.arange(15), weights)
+    repeated = fit(states[rows], targets[rows], np.ones(len(rows)))
+    query = np.random.default_rng(4).normal(size=(20, 2))
+    np.testing.assert_allclose(weighted.mean(query), repeated.mean(query), rtol=1e-8)
+    np.testing.assert_allclose(
+        weighted.standard_deviation(query), repeated.standard_deviation(query), rtol=1e-8
+    )
+
+
+def test_far_from_all_samples_the_policy_is_its_prior() -> None:
+    policy = fit(*samples(15, 5))
+    far = np.array([[1e3, -1e3]])
+    np.testing.assert_allclose(policy.mean(far), [[0.0, 20.0]], atol=1e-12)
+    wanted = np.sqrt(SIGNAL + NOISE) * np.array([[1.0, 10.0]])
+    np.testing.assert_allclose(policy.standard_deviation(far), wanted, rtol=1e-12)
+
+
+def test_at_a_heavy_sample_the_mean_is_its_target_and_only_the_noise_is_left() -> None:
+    states, targets, weights = samples(10, 6)
+    weights[4] = 1e7
+    policy = fit(states, targets, weights)
+    wanted = [[targets[4, 0], 20.0 + 10.0 * targets[4, 1]]]
+    np.testing.assert_allclose(policy.mean(states[4:5]), wanted, atol=1e-5)
+    spread = np.sqrt(NOISE) * np.array([[1.0, 10.0]])
+    np.testing.assert_allclose(policy.standard_deviation(states[4:5]), spread, rtol=1e-5)
+
+
+def test_a_lighter_sample_pulls_less() -> None:
+    state, target = np.zeros((1, 2)), np.ones((1, 2))
+    means = [fit(state, target, np.array([w])).mean(state)[0, 0] for w in (0.1, 1.0, 10.0)]
+    # One sample: sf2 / (sf2 + l / w).
+    np.testing.assert_allclose(means, [SIGNAL / (SIGNAL + NOISE / w) for w in (0.1, 1.0, 10.0)])
+
+
+def test_an_action_is_the_mean_plus_the_deviation_times_the_noise() -> None:
+    policy = fit(*samples(20, 7))
+    rng = np.random.default_rng(8)
+    query, noise = rng.normal(size=(9, 2)), rng.normal(size=(9, 2))
+    wanted = policy.mean(query) + policy.standard_deviation(query) * noise
+    np.testing.assert_allclose(policy.act(query, noise), wanted, rtol=1e-10)
+    np.testing.assert_array_equal(policy.act(query, np.zeros((9, 2))), policy.mean(query))
+
+
+def test_commanded_actions_are_not_clipped() -> None:
+    policy = fit(*samples(20, 9))
+    actions = policy.act(np.zeros((2, 2)), np.array([[9.0, 9.0], [-9.0, -9.0]]))
+    assert (actions[0] > TASK.action_high).all()
+    assert (actions[1] < TASK.action_low).all()
+
+
+def test_the_action_scale_is_only_a_unit() -> None:
+    data = samples(20, 10)
+    policy = fit(*data)
+    unit = fit(*data, task=TaskSpec(2, np.full(2, -1.0), np.full(2, 1.0)))
+    rng = np.random.default_rng(11)
+    query, noise = rng.normal(size=(6, 2)), rng.normal(size=(6, 2))
+    np.testing.assert_allclose(
+        policy.act(query, noise), [0.0, 20.0] + unit.act(query, noise) * [1.0, 10.0], rtol=1e-12
+    )
+
+
+def test_duplicated_states_without_noise_need_jitter_and_say_so() -> None:
+    states = np.zeros((3, 2))
+    policy = CostSensitiveGP.fit(TASK, KERNEL, states, np.ones((3, 2)), np.ones(3), 1.0, 1e-18)
+    assert policy.jitter > 0.0
+    np.testing.assert_allclose(policy.mean(states), [[1.0, 30.0]] * 3, rtol=1e-3)
+
+
+def test_bang_bang_takes_the_limits_and_nothing_between() -> None:
+    noise = np.random.default_rng(12).normal(size=(2000, 2))
+    actions = BangBang(TASK).act(np.zeros((2000, 2)), noise)
+    np.testing.assert_array_equal(np.unique(actions[:, 0]), [-1.0, 1.0])
+    np.testing.assert_array_equal(np.unique(actions[:, 1]), [10.0, 30.0])
+    # Signs of the two actions are independent, each limit equally likely.
+    high = actions == TASK.action_high
+    assert np.abs(high.mean(axis=0) - 0.5).max() < 0.05
+    assert abs(np.mean(high[:, 0] & high[:, 1]) - 0.25) < 0.05
+
+
+@pytest.mark.parametrize("spread", [0.05, 1.0, 2.5])
+def test_gaussian_exploration_has_the_spread_asked_for_in_every_state(spread: float) -> None:
+    rng = np.random.default_rng(13)
+    states, noise = rng.normal(size=(4000, 2)), rng.normal(size=(4000, 2))
+    actions = Gaussian(TASK, spread).act(states, noise)
+    np.testing.assert_allclose(actions.std(axis=0), spread * np.array([1.0, 10.0]), rtol=0.05)
+    np.testing.assert_allclose(
+        actions, [0.0, 20.0] + spread * np.array([1.0, 10.0]) * noise, rtol=1e-12
+    )
