@@ -137,7 +137,7 @@ def plot(run: RunArgument) -> None:
 @app.command(
     epilog="Examples:\n\n"
     "  kreps video runs/swing-up\n\n"
-    "  kreps video runs/swing-up --steps 200 --stochastic --out swing-up.mp4"
+    "  kreps video runs/swing-up --steps 200 --stochastic --out swing-up.gif"
 )
 def video(
     run: RunArgument,
@@ -145,7 +145,7 @@ def video(
     stochastic: Annotated[bool, typer.Option(help="With exploration noise.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the roll-out.")] = 0,
     out: Annotated[
-        Path | None, typer.Option(help="A .gif or .mp4 file; video.gif in the run if not given.")
+        Path | None, typer.Option(help="A .gif file; video.gif in the run if not given.")
     ] = None,
 ) -> None:
     """Film the learnt policy in its environment."""

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import animation, rc_context
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 
 from kreps.algorithms.reps import LearnerState
 from kreps.arrays import FloatArray
@@ -74,21 +75,10 @@ def learning_curve(
                     ms=9 if marker == "*" else 6,
                     label=f"{name} policy, evaluated: {evaluation[name]['mean']:.4g}",
                 )
-        for name, value in references.items():
-            top.axhline(value, color=GREY, lw=0.8, ls="--")
-            top.annotate(
-                f"{name} {value:g}",
-                (0.995, value),
-                xycoords=("axes fraction", "data"),
-                xytext=(0, 2),
-                textcoords="offset points",
-                ha="right",
-                color=GREY,
-                fontsize=7.5,
-            )
+        draw_references(top, references)
         top.set_ylabel("average reward per step")
         top.set_title(title)
-        top.legend(loc="center right")
+        top.legend(loc="lower right", bbox_to_anchor=(1.0, 0.12))
         middle.plot(steps, column("kl"), "o-", color=BLUE, ms=3)
         middle.plot(steps, column("kl_bound"), color=GREY, lw=0.8, ls="--")
         middle.set_ylabel("KL and bound\n[nats]")
@@ -98,6 +88,26 @@ def learning_curve(
         bottom.set_ylim(0, 1)
         bottom.set_xlabel("environment steps seen before")
     return figure
+
+
+def draw_references(axes: Axes, references: Mapping[str, float]) -> None:
+    """A dashed line per value, its name above it; below where the line above is too near."""
+    spread = max(references.values(), default=0.0) - min(references.values(), default=0.0)
+    above = np.inf
+    for name, value in sorted(references.items(), key=lambda item: -item[1]):
+        near = above - value < 0.05 * spread
+        axes.axhline(value, color=GREY, lw=0.8, ls="--", zorder=0)
+        axes.annotate(
+            f"{name} {value:g}",
+            (0.01, value),
+            xycoords=("axes fraction", "data"),
+            xytext=(0, -2 if near else 2),
+            textcoords="offset points",
+            va="top" if near else "bottom",
+            color=GREY,
+            fontsize=7.5,
+        )
+        above = value
 
 
 def policy_maps(
@@ -147,21 +157,20 @@ def film(
     fps: float,
     path: Path,
 ) -> Path:
-    """A roll-out as GIF or MP4: what the camera sees and, for two-dimensional states, the path.
+    """A roll-out as a GIF: what the camera sees and, for two-dimensional states, the path.
 
     Args:
         frames: T pictures (height, width, 3).
         observations: (T, ds) and actions (T, da) that go with them.
-        path: ending in ``.gif``, or ``.mp4`` where ffmpeg is installed.
-
-    Raises:
-        ConfigurationError: another ending, or no ffmpeg.
+        fps: pictures per second of the environment.
+        path: ending in ``.gif``.
     """
-    writer = _writer(path, fps)
+    if path.suffix != ".gif":
+        raise ConfigurationError(f"{path.name!r} is no film; end its name in .gif")
     plane = task.observation_size == 2
     with rc_context({**STYLE, "figure.constrained_layout.use": False}):
         figure = Figure(figsize=(7.6 if plane else 3.8, 3.6), dpi=80)
-        FigureCanvasAgg(figure)
+        canvas = FigureCanvasAgg(figure)
         camera = figure.add_axes((0.01, 0.02, 0.46 if plane else 0.98, 0.86))
         camera.set_axis_off()
         picture = camera.imshow(frames[0])
@@ -170,35 +179,31 @@ def film(
             axes = figure.add_axes((0.57, 0.15, 0.40, 0.73))
             x, y, states = _grid(state, task)
             assert state.policy is not None
-            mean = np.clip(
-                state.policy.mean(states)[:, 0], task.action_low[0], task.action_high[0]
+            low, high = task.action_low[0], task.action_high[0]
+            mean = np.clip(state.policy.mean(states)[:, 0], low, high)
+            axes.contourf(
+                x, y, mean.reshape(len(y), len(x)), np.linspace(low, high, 12), cmap="RdBu_r"
             )
-            _show_map(axes, x, y, mean, "RdBu_r", task.action_low[0], task.action_high[0])
             _label_axes(axes, task, labels)
             axes.set_title("policy mean and path", fontsize=8)
             (trail,) = axes.plot([], [], color="black", lw=1.2)
             (dot,) = axes.plot([], [], "o", color="black", ms=6)
-
-        def draw(t: int) -> list[Any]:
-            picture.set_data(frames[t])
+        images = []
+        for t, frame in enumerate(frames):
+            picture.set_data(frame)
             text.set_text(f"t = {t / fps:5.2f} s   {action_labels[0]} {actions[t, 0]:7.2f}")
             if plane:
                 trail.set_data(*_unwrapped(observations[: t + 1], task))
                 dot.set_data(observations[t : t + 1, 0], observations[t : t + 1, 1])
-            return []
-
-        animation.FuncAnimation(figure, draw, frames=len(frames)).save(path, writer=writer)
+            canvas.draw()
+            images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
+    # one palette without dithering: neighbouring pictures then differ only where things move
+    palette = images[len(images) // 2].quantize(96, dither=Image.Dither.NONE)
+    still = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
+    still[0].save(
+        path, save_all=True, append_images=still[1:], duration=round(1000 / fps), loop=0
+    )
     return path
-
-
-def _writer(path: Path, fps: float) -> animation.AbstractMovieWriter:
-    if path.suffix == ".gif":
-        return animation.PillowWriter(fps=round(fps))
-    if path.suffix == ".mp4":
-        if not animation.FFMpegWriter.isAvailable():
-            raise ConfigurationError("an .mp4 needs ffmpeg, which is not installed; choose a .gif")
-        return animation.FFMpegWriter(fps=round(fps))
-    raise ConfigurationError(f"{path.name!r} is no film; end its name in .gif or .mp4")
 
 
 def _grid(state: LearnerState, task: TaskSpec) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -10,8 +10,15 @@ import numpy as np
 
 from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
+from kreps.errors import ConfigurationError
 from kreps.kernels import Kernel, gaussian_gram
-from kreps.linalg import cholesky, solve_lower
+from kreps.linalg import (
+    Cholesky,
+    cholesky,
+    pivoted_cholesky,
+    solve_lower,
+    solve_lower_transposed,
+)
 
 
 class StochasticPolicy(Protocol):
@@ -43,6 +50,13 @@ class Gaussian:
         return self.task.action_centre + self.spread * self.task.action_scale * noise
 
 
+MAX_SUPPORT = 10_000
+"""Most support points of an exact policy: it costs their square in memory, their cube in time."""
+
+PIVOT_TOLERANCE = 1e-12
+"""Largest squared residual of a support point's kernel function outside the span of the pivots'."""
+
+
 @dataclass(frozen=True)
 class CostSensitiveGP:
     """Gaussian process policy in which a sample of weight w counts as w samples.
@@ -53,66 +67,126 @@ class CostSensitiveGP:
     Attributes:
         task: gives centre, scale and limits of the actions.
         kernel: over states.
-        support: (m, ds) states.
-        alpha: (m, da) ``C^-1 U``.
-        lower: (m, m) Cholesky factor of C.
+        states: (m, ds) support points.
+        targets: (m, da) their actions U, in units of the action scale around the centre.
+        weights: (m,) their weights w > 0.
         signal: sf2.
         noise: l.
-        jitter: what C needed on its diagonal to be factorised.
+
+    Raises:
+        ConfigurationError: more than `MAX_SUPPORT` support points.
+        NumericalError: C cannot be factorised.
     """
 
     task: TaskSpec
     kernel: Kernel
-    support: FloatArray
-    alpha: FloatArray
-    lower: FloatArray
+    states: FloatArray
+    targets: FloatArray
+    weights: FloatArray
     signal: float
     noise: float
-    jitter: float
 
-    @classmethod
-    def fit(
-        cls,
-        task: TaskSpec,
-        kernel: Kernel,
-        support: FloatArray,
-        targets: FloatArray,
-        weights: FloatArray,
-        signal: float,
-        noise: float,
-    ) -> CostSensitiveGP:
-        """The posterior for ``targets`` (m, da) in units of the action scale and weights (m,)."""
-        c = signal * kernel.gram(support)
-        c.flat[:: len(c) + 1] += noise / weights
-        factor = cholesky(c)
-        alpha = factor.solve(targets)
-        return cls(task, kernel, support, alpha, factor.lower, signal, noise, factor.jitter)
+    def __post_init__(self) -> None:
+        if len(self.weights) > MAX_SUPPORT:
+            raise ConfigurationError(
+                f"the policy would have {len(self.weights)} support points, the limit is "
+                f"{MAX_SUPPORT}; keep fewer roll-outs by a smaller window"
+            )
+        _ = self.predictor  # now, not in the first control cycle
+
+    @cached_property
+    def factor(self) -> Cholesky:
+        """Of C."""
+        c = self.signal * self.kernel.gram(self.states)
+        c.flat[:: len(c) + 1] += self.noise / self.weights
+        return cholesky(c)
+
+    @cached_property
+    def alpha(self) -> FloatArray:
+        """``C^-1 U``, (m, da)."""
+        return self.factor.solve(self.targets)
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """What the control loop evaluates."""
+        return Predictor.of(self)
 
     def mean(self, states: FloatArray) -> FloatArray:
         """Mean action (m, da) at states (m, ds), in the task's units, not clipped."""
-        return self._actions(self._covariances(states).T @ self.alpha)
+        return self._actions(self.predictor.mean(self.predictor.covariances(states)))
 
     def standard_deviation(self, states: FloatArray) -> FloatArray:
         """Standard deviation (m, da) of the commanded action, in the task's units."""
-        spread = self._spread(self._covariances(states))
+        spread = self.predictor.standard_deviation(self.predictor.covariances(states))
         return spread[:, None] * self.task.action_scale
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
-        k = self._covariances(states)
-        return self._actions(k.T @ self.alpha + self._spread(k)[:, None] * noise)
-
-    @cached_property
-    def _support_coordinates(self) -> FloatArray:
-        """Embedded once, as the control loop asks for one state at a time."""
-        return self.kernel.embed(self.support)
-
-    def _covariances(self, states: FloatArray) -> FloatArray:
-        return self.signal * gaussian_gram(self._support_coordinates, self.kernel.embed(states))
-
-    def _spread(self, k: FloatArray) -> FloatArray:
-        explained = solve_lower(self.lower, k)
-        variance = self.signal - np.einsum("ij,ij->j", explained, explained)
-        return np.sqrt(np.maximum(variance, 0.0) + self.noise)
+        k = self.predictor.covariances(states)
+        spread = self.predictor.standard_deviation(k)
+        return self._actions(self.predictor.mean(k) + spread[:, None] * noise)
 
     def _actions(self, scaled: FloatArray) -> FloatArray:
         return self.task.action_centre + self.task.action_scale * scaled
+
+
+@dataclass(frozen=True)
+class Predictor:
+    """Mean and variance of a cost-sensitive GP from its kernel values at r pivots only.
+
+    The kernel of any state with the m support points is, to `PIVOT_TOLERANCE`, a linear function
+    of its kernel with r of them (the pivots of a Cholesky factorisation), and r << m for smooth
+    kernels.  So both moments become products with (r, r) matrices computed once: a control
+    cycle costs r^2 instead of m^2.
+
+    Attributes:
+        kernel: over states.
+        coordinates: (r, e) embedded pivots.
+        mean_weights: (r, da), the mean is ``k' mean_weights``.
+        explained: (r, r), the explained variance is ``|explained k|^2``.
+        signal, noise: sf2 and l.
+    """
+
+    kernel: Kernel
+    coordinates: FloatArray
+    mean_weights: FloatArray
+    explained: FloatArray
+    signal: float
+    noise: float
+
+    @classmethod
+    def of(cls, policy: CostSensitiveGP) -> Predictor:
+        kernel, states = policy.kernel, policy.states
+        chosen = pivoted_cholesky(
+            np.ones(len(states)),
+            lambda rows: kernel.gram(states, states[rows]),
+            tolerance=PIVOT_TOLERANCE,
+            max_rank=len(states),
+        )
+        # k(states, s) = columns phi(s) with phi(s) = lower^-1 k(pivots, s)
+        lower = np.tril(chosen.columns[chosen.pivots])
+        columns = policy.signal * chosen.columns
+        mean_weights = solve_lower_transposed(lower, columns.T @ policy.alpha)
+        # k' C^-1 k = |L^-1 columns phi|^2 = |R phi|^2 with R from the QR of L^-1 columns
+        r = np.linalg.qr(solve_lower(policy.factor.lower, columns), mode="r")
+        return cls(
+            kernel,
+            kernel.embed(states[chosen.pivots]),
+            mean_weights,
+            np.ascontiguousarray(solve_lower_transposed(lower, r.T).T),
+            policy.signal,
+            policy.noise,
+        )
+
+    def covariances(self, states: FloatArray) -> FloatArray:
+        """Kernel values (r, m) of the pivots with states (m, ds)."""
+        return gaussian_gram(self.coordinates, self.kernel.embed(states))
+
+    def mean(self, k: FloatArray) -> FloatArray:
+        """(m, da), scaled."""
+        return k.T @ self.mean_weights
+
+    def standard_deviation(self, k: FloatArray) -> FloatArray:
+        """(m,), scaled: ``sqrt(sf2 - k' C^-1 k + l)``."""
+        explained = self.explained @ k
+        variance = self.signal - np.einsum("ij,ij->j", explained, explained)
+        return np.sqrt(np.maximum(variance, 0.0) + self.noise)

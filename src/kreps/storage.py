@@ -24,6 +24,7 @@ from kreps.errors import KrepsError, StorageError
 from kreps.kernels import Kernel, factors_of
 from kreps.policies import CostSensitiveGP
 from kreps.settings import Settings
+from kreps.threads import blas_threads
 from kreps.value import ValueFunction
 
 VERSION = 1
@@ -162,10 +163,10 @@ def _state_kernel(task: TaskSpec, lengthscales: FloatArray) -> Kernel:
 def _policy_parts(policy: CostSensitiveGP) -> Tensors:
     return {
         "policy.lengthscales": policy.kernel.lengthscales,
-        "policy.support": policy.support,
-        "policy.alpha": policy.alpha,
-        "policy.lower": policy.lower,
-        "policy.signal_noise_jitter": np.array([policy.signal, policy.noise, policy.jitter]),
+        "policy.states": policy.states,
+        "policy.targets": policy.targets,
+        "policy.weights": policy.weights,
+        "policy.signal_and_noise": np.array([policy.signal, policy.noise]),
     }
 
 
@@ -174,28 +175,28 @@ def _policy_of(tensors: Tensors, task: TaskSpec) -> CostSensitiveGP:
         tensors,
         {
             "policy.lengthscales": ("factors",),
-            "policy.support": ("m", "ds"),
-            "policy.alpha": ("m", "da"),
-            "policy.lower": ("m", "m"),
-            "policy.signal_noise_jitter": (3,),
+            "policy.states": ("m", "ds"),
+            "policy.targets": ("m", "da"),
+            "policy.weights": ("m",),
+            "policy.signal_and_noise": (2,),
         },
         factors=task.observation_size,
         ds=task.observation_size,
         da=task.action_size,
     )
-    signal, noise, jitter = t["policy.signal_noise_jitter"].tolist()
-    if len(t["policy.support"]) == 0 or signal <= 0 or noise <= 0:
-        raise StorageError("the policy has no support point or a variance that is not positive")
-    return CostSensitiveGP(
-        task=task,
-        kernel=_state_kernel(task, t["policy.lengthscales"]),
-        support=t["policy.support"],
-        alpha=t["policy.alpha"],
-        lower=np.asfortranarray(t["policy.lower"]),
-        signal=signal,
-        noise=noise,
-        jitter=jitter,
-    )
+    weights, variances = t["policy.weights"], t["policy.signal_and_noise"]
+    if not (len(weights) > 0 and (weights > 0).all() and (variances > 0).all()):
+        raise StorageError("the policy has no support point, or weights or variances <= 0")
+    with blas_threads(1):  # as while learning, so that it is the same policy to the last bit
+        return CostSensitiveGP(
+            task=task,
+            kernel=_state_kernel(task, t["policy.lengthscales"]),
+            states=t["policy.states"],
+            targets=t["policy.targets"],
+            weights=weights,
+            signal=float(variances[0]),
+            noise=float(variances[1]),
+        )
 
 
 def _value_parts(value: ValueFunction) -> Tensors:

@@ -181,7 +181,7 @@ def update(
         policy_parameters=np.exp(policy_x),
         jitter=max(
             dual.jitter,
-            policy.jitter,
+            policy.factor.jitter,
             model.factor.jitter if isinstance(model, KernelEmbedding) else 0.0,
         ),
         seconds=clock.seconds,
@@ -320,7 +320,7 @@ def fit_policy(
     samples: PolicySamples, state_kernel: Kernel, task: TaskSpec, x: FloatArray
 ) -> CostSensitiveGP:
     """The policy at log hyper-parameters ``x`` (g + 2,)."""
-    return CostSensitiveGP.fit(
+    return CostSensitiveGP(
         task,
         state_kernel.with_lengthscales(np.exp(x[:-2])),
         samples.states,

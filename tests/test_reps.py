@@ -1,0 +1,429 @@
+"""Algorithm 1 on small synthetic data: one update, its parts, and its odd cases."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from kreps.algorithms.reps import (
+    DROPPED_WEIGHT,
+    LearnerState,
+    PolicySamples,
+    UpdateInfo,
+    feature_differences,
+    successor_features,
+    update,
+)
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec, Transitions, Window
+from kreps.dual import KL_TOLERANCE, Outcome, kl_from_uniform
+from kreps.errors import DataError
+from kreps.kernels import Kernel, factors_of
+from kreps.settings import Settings, settings_of
+
+TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
+
+
+def collect(
+    rollouts: int = 10, steps: int = 15, seed: int = 0, terminated: bool = False
+) -> list[Rollout]:
+    """A point mass with friction, pushed at random and rewarded for resting at the origin."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for _ in range(rollouts):
+        state = np.array([rng.normal(), 0.0])
+        observations, actions, rewards = [state], [], []
+        for _ in range(steps):
+            action = rng.normal(0.0, 2.0, size=1)  # often beyond the limits
+            force = TASK.clip(action)[0]
+            rewards.append(-(state[0] ** 2) - 0.1 * state[1] ** 2 - 0.01 * force**2)
+            velocity = 0.9 * state[1] + 0.3 * force + 0.05 * rng.normal()
+            state = np.array([state[0] + 0.3 * velocity, velocity])
+            observations.append(state)
+            actions.append(action)
+        found.append(Rollout(np.array(observations), np.array(actions), np.array(rewards), terminated))
+    return found
+
+
+def fresh(capacity: int = 30) -> LearnerState:
+    return LearnerState(Window(capacity))
+
+
+def run(
+    rollouts: list[Rollout],
+    settings: Settings | None = None,
+    state: LearnerState | None = None,
+    seed: int = 0,
+    task: TaskSpec = TASK,
+) -> tuple[LearnerState, UpdateInfo]:
+    return update(
+        fresh() if state is None else state,
+        rollouts,
+        task,
+        settings_of() if settings is None else settings,
+        np.random.default_rng(seed),
+    )
+
+
+def with_rewards(rollouts: list[Rollout], change: Any) -> list[Rollout]:
+    return [replace(r, rewards=change(r.rewards)) for r in rollouts]
+
+
+def fingerprint(state: LearnerState) -> list[bytes]:
+    """The bytes of everything that was learnt."""
+    assert state.policy is not None
+    assert state.value is not None
+    arrays = [
+        state.policy.support,
+        state.policy.alpha,
+        state.policy.lower,
+        state.policy.kernel.lengthscales,
+        np.array([state.policy.signal, state.policy.noise, state.policy.jitter]),
+        state.value.centres,
+        state.value.alpha,
+        state.value.kernel.lengthscales,
+    ]
+    arrays += [a for a in (state.embedding_start, state.policy_start) if a is not None]
+    return [a.tobytes() for a in arrays]
+
+
+def assert_bounded(info: UpdateInfo, settings: Settings) -> None:
+    """KL is at its bound, or below it with the temperature at its floor."""
+    dual = info.dual
+    assert dual.converged
+    assert dual.weights.shape == (info.samples,)
+    assert dual.weights.sum() == pytest.approx(1.0, abs=1e-12)
+    assert (dual.weights >= 0.0).all()
+    kl = kl_from_uniform(dual.weights)
+    if dual.outcome is Outcome.AT_FLOOR:
+        assert dual.eta == pytest.approx(max(settings.eta_floor, 1e-6))
+        assert kl <= settings.kl_bound * (1.0 + KL_TOLERANCE)
+    else:
+        assert kl == pytest.approx(settings.kl_bound, rel=1.01 * KL_TOLERANCE)
+
+
+@pytest.mark.parametrize("model", ["embedding", "sample"])
+@pytest.mark.parametrize("recipe", ["default", "paper"])
+def test_the_weights_move_as_far_as_the_bound_or_the_floor_permits(recipe: str, model: str) -> None:
+    settings = settings_of(recipe, model=model)
+    _, info = run(collect(), settings)
+    assert_bounded(info, settings)
+    assert info.samples == 150
+    assert info.effective_samples == pytest.approx(1.0 / np.sum(info.dual.weights**2))
+    assert info.effective_samples < 140.0
+    assert info.rank_residual <= settings.basis_tolerance
+    assert (info.embedding_parameters is None) == (model == "sample")
+
+
+def test_a_high_floor_keeps_the_update_short_of_the_bound() -> None:
+    settings = settings_of(kl_bound=3.0, eta_floor=2.0)
+    _, info = run(collect(), settings)
+    assert info.dual.outcome is Outcome.AT_FLOOR
+    assert info.dual.eta == 2.0
+    assert 0.0 < info.dual.kl < 2.0
+
+
+@pytest.mark.parametrize("model", ["embedding", "sample"])
+def test_the_weights_are_the_exponentials_of_the_bellman_errors(model: str) -> None:
+    """Eqs. 1, 4 and 5 put together from the learnt V and hyper-parameters, in plain NumPy."""
+    restart = 0.07
+    rollouts = collect(steps=12) + collect(4, 5, seed=1, terminated=True)
+    settings = settings_of(model=model, restart_probability=restart)
+    state, info = run(rollouts, settings)
+    value = state.value
+    assert value is not None
+
+    states = np.concatenate([r.observations[:-1] for r in rollouts])
+    rewards = np.concatenate([r.rewards for r in rollouts])
+    at_start = np.mean([value(r.observations[:1])[0] for r in rollouts])
+    after = []
+    for r in rollouts:
+        v = value(r.observations[1:])
+        if r.terminated:
+            v[-1] = at_start
+        after.append(v)
+    expected = np.concatenate(after)
+    if model == "embedding":
+        assert info.embedding_parameters is not None
+        applied = np.clip(np.concatenate([r.actions for r in rollouts]), -2.0, 2.0) / 2.0
+        inputs = np.column_stack([states, applied]) / info.embedding_parameters[:-1]
+        squares = ((inputs[:, None] - inputs) ** 2).sum(axis=2)
+        gram = np.exp(-0.5 * squares)
+        noise = info.embedding_parameters[-1] * np.eye(len(gram))
+        expected = gram @ np.linalg.solve(gram + noise, expected)
+    delta = rewards + (1.0 - restart) * expected + restart * at_start - value(states)
+    wanted = np.exp((delta - delta.max()) / (info.dual.eta * rewards.std()))
+    wanted /= wanted.sum()
+    assert np.abs(info.dual.weights - wanted).sum() < 1e-5
+
+
+def test_the_policy_is_the_weighted_process_of_the_commanded_actions() -> None:
+    rollouts = collect()
+    state, info = run(rollouts)
+    assert state.policy is not None
+    p = info.dual.weights
+    kept = 150 * p >= DROPPED_WEIGHT
+    assert 0 < kept.sum() < 150
+    assert info.support == kept.sum()
+    weights = p[kept] / np.sum(p**2)
+    states = np.concatenate([r.observations[:-1] for r in rollouts])[kept]
+    commanded = np.concatenate([r.actions for r in rollouts])[kept] / 2.0
+    assert np.abs(commanded).max() > 1.0  # not the clipped ones
+    signal, noise = info.policy_parameters[-2:]
+    kernel = Kernel(factors_of(2), info.policy_parameters[:-2])
+    query = np.random.default_rng(3).normal(size=(12, 2))
+    c = signal * kernel.gram(states) + noise * np.diag(1.0 / weights)
+    k = signal * kernel.gram(states, query)
+    np.testing.assert_allclose(
+        state.policy.mean(query), 2.0 * k.T @ np.linalg.solve(c, commanded), rtol=1e-6, atol=1e-8
+    )
+    variance = signal - np.einsum("ij,ij->j", k, np.linalg.solve(c, k)) + noise
+    np.testing.assert_allclose(
+        state.policy.standard_deviation(query)[:, 0], 2.0 * np.sqrt(variance), rtol=1e-6
+    )
+
+
+def test_the_new_policy_pushes_towards_the_reward() -> None:
+    state, _ = run(collect(20, 15, seed=5))
+    assert state.policy is not None
+    left, right = state.policy.mean(np.array([[-1.0, 0.0], [1.0, 0.0]]))[:, 0]
+    assert left > 0.1
+    assert right < -0.1
+
+
+def test_one_seed_gives_one_policy_to_the_last_byte() -> None:
+    # More than 500 points and 400 samples, so that every random choice is really made.
+    rollouts = collect(36, 15)
+    state = fresh(40)
+    first, second, other = (run(rollouts, state=state, seed=seed)[0] for seed in (7, 7, 8))
+    assert fingerprint(first) == fingerprint(second)
+    assert fingerprint(first) != fingerprint(other)
+
+
+def test_the_old_state_is_not_modified() -> None:
+    first, _ = run(collect(seed=1))
+    before = fingerprint(first)
+    kept = first.window.rollouts
+    bytes_kept = [r.observations.tobytes() + r.rewards.tobytes() for r in kept]
+    second, _ = run(collect(seed=2), state=first)
+    assert fingerprint(first) == before
+    assert first.window.rollouts is kept
+    assert [r.observations.tobytes() + r.rewards.tobytes() for r in kept] == bytes_kept
+    assert (first.iteration, first.rollouts, first.steps) == (1, 10, 150)
+    assert (second.iteration, second.rollouts, second.steps) == (2, 20, 300)
+    assert fingerprint(second) != before
+
+
+def test_forgotten_rollouts_are_counted_but_not_learnt_from() -> None:
+    old, new = collect(6, seed=1), collect(6, 10, seed=2)
+    sample = settings_of(model="sample")
+    first, _ = run(old, sample, fresh(6))
+    second, info = run(new, sample, replace(first, policy_start=None))
+    alone, _ = run(new, sample, fresh(6))
+    assert info.samples == 60
+    assert (second.rollouts, second.steps) == (12, 6 * 15 + 6 * 10)
+    assert fingerprint(second) == fingerprint(alone)
+
+
+def test_no_new_rollouts_are_learnt_from_when_old_ones_are_kept() -> None:
+    first, _ = run(collect(5))
+    second, info = run([], state=first)
+    assert info.samples == 75
+    assert (second.iteration, second.rollouts, second.steps) == (2, 5, 75)
+
+
+def test_nothing_to_learn_from_is_refused() -> None:
+    with pytest.raises(DataError):
+        run([])
+
+
+@pytest.mark.parametrize(("ds", "da"), [(3, 1), (1, 1), (2, 2)])
+def test_rollouts_of_another_width_are_refused(ds: int, da: int) -> None:
+    stranger = Rollout(np.zeros((4, ds)), np.zeros((3, da)), np.zeros(3))
+    state = fresh()
+    with pytest.raises(DataError):
+        run([*collect(2), stranger], state=state)
+    assert state.window.rollouts == ()
+
+
+@pytest.mark.parametrize("scale", [1e-8, 1e8])
+@pytest.mark.parametrize("recipe", ["default", "paper"])
+def test_the_unit_of_the_reward_changes_nothing_but_the_unit_of_v(
+    recipe: str, scale: float
+) -> None:
+    rollouts = collect()
+    settings = settings_of(recipe)
+    state, info = run(rollouts, settings)
+    scaled_state, scaled = run(with_rewards(rollouts, lambda r: scale * r), settings)
+    np.testing.assert_allclose(scaled.dual.weights, info.dual.weights, atol=1e-6)
+    assert state.value is not None
+    assert scaled_state.value is not None
+    query = np.random.default_rng(4).normal(size=(10, 2))
+    v = state.value(query)
+    np.testing.assert_allclose(scaled_state.value(query) / scale, v, atol=1e-5 * np.abs(v).max())
+
+
+def test_a_constant_added_to_the_reward_changes_nothing() -> None:
+    rollouts = collect()
+    _, info = run(rollouts)
+    _, moved = run(with_rewards(rollouts, lambda r: r + 100.0))
+    np.testing.assert_allclose(moved.dual.weights, info.dual.weights, atol=1e-8)
+
+
+@pytest.mark.parametrize("recipe", ["default", "paper"])
+def test_equal_rewards_are_learnt_from_without_harm(recipe: str) -> None:
+    settings = settings_of(recipe)
+    state, info = run(with_rewards(collect(), lambda r: np.full_like(r, -3.0)), settings)
+    assert_bounded(info, settings)
+    assert_usable(state)
+
+
+def assert_usable(state: LearnerState, task: TaskSpec = TASK) -> None:
+    assert state.policy is not None
+    assert state.value is not None
+    query = np.random.default_rng(5).normal(size=(20, task.observation_size))
+    assert np.isfinite(state.policy.mean(query)).all()
+    assert (state.policy.standard_deviation(query) > 0.0).all()
+    assert np.isfinite(state.value(query)).all()
+
+
+@pytest.mark.parametrize("model", ["embedding", "sample"])
+def test_duplicated_states_are_served(model: str) -> None:
+    rollouts = collect(4, 10)
+    settings = settings_of(model=model)
+    state, info = run(rollouts * 3, settings)
+    assert_bounded(info, settings)
+    assert_usable(state)
+    assert info.rank <= 44
+    # Copies of a sample share its weight.
+    weights = info.dual.weights.reshape(3, 40)
+    np.testing.assert_allclose(weights[1:], weights[:1].repeat(2, axis=0), atol=1e-9)
+
+
+def test_a_single_distinct_state_is_served() -> None:
+    rng = np.random.default_rng(6)
+    still = [
+        Rollout(np.full((6, 2), 0.3), rng.normal(size=(5, 1)), rng.normal(size=5)) for _ in range(4)
+    ]
+    settings = settings_of()
+    state, info = run(still, settings)
+    assert info.rank == 1
+    assert_bounded(info, settings)
+    assert_usable(state)
+
+
+@pytest.mark.parametrize("recipe", ["default", "paper"])
+def test_a_single_distinct_action_is_served(recipe: str) -> None:
+    same = [replace(r, actions=np.full_like(r.actions, 0.5)) for r in collect()]
+    settings = settings_of(recipe)
+    state, info = run(same, settings)
+    assert_bounded(info, settings)
+    assert_usable(state)
+    assert state.policy is not None
+    near = np.concatenate([r.observations[:-1] for r in same])[info.dual.weights > 0.01]
+    np.testing.assert_allclose(state.policy.mean(near), 0.5, atol=0.1)
+
+
+@pytest.mark.parametrize("recipe", ["default", "paper"])
+def test_a_single_step_is_served(recipe: str) -> None:
+    one = [Rollout(np.array([[0.0, 0.0], [0.1, 0.3]]), np.array([[1.0]]), np.array([-1.0]))]
+    settings = settings_of(recipe)
+    state, info = run(one, settings)
+    np.testing.assert_array_equal(info.dual.weights, [1.0])
+    assert info.dual.outcome is Outcome.AT_FLOOR
+    assert info.support == 1
+    assert_usable(state)
+
+
+def test_rewards_with_one_enormous_outlier_are_served() -> None:
+    rollouts = collect()
+    spoilt = np.array(rollouts[0].rewards)
+    spoilt[3] = -1e9
+    rollouts[0] = replace(rollouts[0], rewards=spoilt)
+    settings = settings_of()
+    state, info = run(rollouts, settings)
+    assert_bounded(info, settings)
+    assert info.dual.weights[3] < 1e-6
+    assert_usable(state)
+
+
+def test_a_periodic_coordinate_is_learnt_as_one() -> None:
+    task = replace(TASK, periodic=(0,))
+    state, _ = run(collect(), task=task)
+    assert state.policy is not None
+    assert state.value is not None
+    query = np.random.default_rng(9).normal(size=(10, 2))
+    turned = query + [2.0 * np.pi, 0.0]
+    np.testing.assert_allclose(state.policy.mean(turned), state.policy.mean(query), atol=1e-8)
+    np.testing.assert_allclose(state.value(turned), state.value(query), atol=1e-6)
+
+
+def test_several_actions_of_unequal_scale_are_served() -> None:
+    rng = np.random.default_rng(10)
+    task = TaskSpec(2, np.array([-2.0, 0.0]), np.array([2.0, 1000.0]))
+    rollouts = [
+        replace(r, actions=np.column_stack([r.actions, rng.uniform(0, 1000, len(r))]))
+        for r in collect()
+    ]
+    settings = settings_of()
+    state, info = run(rollouts, settings, task=task)
+    assert_bounded(info, settings)
+    assert state.policy is not None
+    mean = state.policy.mean(np.array([[0.0, 0.0], [50.0, 50.0]]))
+    assert mean.shape == (2, 2)
+    np.testing.assert_allclose(mean[1], [0.0, 500.0], atol=1e-6)  # far away: the centre
+
+
+# Parts
+
+
+def transitions(terminated: bool) -> tuple[Transitions, FloatArray]:
+    rollouts = collect(3, 4, terminated=terminated) + collect(1, 2, seed=3)
+    data = Transitions.of(rollouts)
+    return data, np.random.default_rng(11).normal(size=(len(data.points), 5))
+
+
+def test_successor_features_are_those_of_the_next_point() -> None:
+    data, features = transitions(terminated=False)
+    np.testing.assert_array_equal(successor_features(data, features), features[data.state + 1])
+
+
+def test_after_an_end_the_successor_is_the_mean_start() -> None:
+    data, features = transitions(terminated=True)
+    before = features.copy()
+    found = successor_features(data, features)
+    ends = np.array([3, 7, 11])
+    mean_start = (features[0] + features[5] + features[10] + features[15]) / 4.0
+    np.testing.assert_allclose(found[ends], np.tile(mean_start, (3, 1)))
+    others = np.setdiff1d(np.arange(len(data)), ends)
+    np.testing.assert_array_equal(found[others], features[data.successor[others]])
+    np.testing.assert_array_equal(features, before)
+
+
+@pytest.mark.parametrize("restart", [0.02, 0.5])
+def test_the_restart_mixes_the_expectation_with_the_mean_start(restart: float) -> None:
+    data, features = transitions(terminated=False)
+    expected = np.random.default_rng(12).normal(size=(len(data), 5))
+    found = feature_differences(data, features, expected, restart)
+    mean_start = (features[0] + features[5] + features[10] + features[15]) / 4.0
+    for i, row in enumerate(found):
+        wanted = (1.0 - restart) * expected[i] + restart * mean_start - features[data.state[i]]
+        np.testing.assert_allclose(row, wanted, atol=1e-14)
+
+
+def test_policy_samples_drop_what_weighs_next_to_nothing() -> None:
+    data, _ = transitions(terminated=False)
+    task = TaskSpec(2, np.array([1.0]), np.array([5.0]))
+    n = len(data)
+    p = np.full(n, 1.0)
+    p[[1, 4]] = 1e-4
+    p /= p.sum()
+    found = PolicySamples.of(data, p, task)
+    kept = np.setdiff1d(np.arange(n), [1, 4])
+    np.testing.assert_array_equal(found.states, data.states[kept])
+    np.testing.assert_allclose(found.targets, (data.actions[kept] - 3.0) / 2.0)
+    np.testing.assert_allclose(found.weights, p[kept] / np.sum(p**2))
+    assert found.weights.sum() == pytest.approx(1.0 / np.sum(p**2), rel=1e-3)
