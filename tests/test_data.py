@@ -38,7 +38,9 @@ def test_a_task_knows_centre_scale_and_limits_of_its_actions() -> None:
     assert spec.action_size == 2
     np.testing.assert_array_equal(spec.action_centre, [0.0, 3.0])
     np.testing.assert_array_equal(spec.action_scale, [1.0, 3.0])
-    np.testing.assert_array_equal(spec.clip(np.array([[-2.0, 9.0], [0.5, 1.0]])), [[-1, 6], [0.5, 1]])
+    np.testing.assert_array_equal(
+        spec.clip(np.array([[-2.0, 9.0], [0.5, 1.0]])), [[-1, 6], [0.5, 1]]
+    )
     assert spec.periodic == (0, 2)
 
 
@@ -74,7 +76,9 @@ def test_an_impossible_task_is_refused(changes: dict[str, Any]) -> None:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_value_that_is_not_finite_is_refused_and_its_row_named(name: str, bad: float) -> None:
     good = rollout(5)
-    arrays = {key: np.array(getattr(good, key)) for key in ("observations", "actions", "rewards")}
+    arrays: dict[str, Any] = {
+        key: np.array(getattr(good, key)) for key in ("observations", "actions", "rewards")
+    }
     arrays[name][3] = bad
     with pytest.raises(DataError, match=rf"{name}.*row 3"):
         Rollout(**arrays)

@@ -294,12 +294,9 @@ def test_at_the_floor_the_update_is_the_soft_maximum_of_that_temperature(seed: i
     assert found.kl < 0.9 * problem.kl_bound
     # Optimal in theta at that temperature, by another method.
     reference = minimize(
-        lambda theta: (
-            value_by_the_book(problem, problem.eta_floor, theta),
-            dual_gradient(problem, problem.eta_floor, theta)[1],
-        ),
+        lambda theta: value_by_the_book(problem, problem.eta_floor, theta),
         np.zeros(7),
-        jac=True,
+        jac=lambda theta: dual_gradient(problem, problem.eta_floor, theta)[1],
         method="BFGS",
         options={"gtol": 1e-9},
     )
@@ -375,6 +372,19 @@ def test_a_bound_that_cannot_be_reached_ends_at_the_floor() -> None:
     np.testing.assert_allclose(found.weights, [1.0, 0.0], atol=1e-12)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_an_optimum_at_a_tiny_floor_is_recognised_with_many_features(seed: int) -> None:
+    # Nearly as many features as samples: balancing them leaves the bound no room.
+    rng = np.random.default_rng(seed)
+    rewards, _ = standardise(rng.normal(size=40))
+    differences = rng.normal(0.0, 0.5, size=(40, 38))
+    problem = DualProblem(rewards, differences, 1.0, 0.1 / 40, TINY_FLOOR)
+    found = solve_dual(problem)
+    assert found.kl < problem.kl_bound
+    assert found.eta == pytest.approx(TINY_FLOOR, rel=1e-9)
+    assert found.outcome is Outcome.AT_FLOOR
+
+
 @pytest.mark.parametrize("scale", [1e-8, 1e8])
 @pytest.mark.parametrize("offset", [0.0, 5.0])
 def test_units_of_the_reward_do_not_change_the_weights(scale: float, offset: float) -> None:
@@ -417,6 +427,33 @@ def test_the_fallback_finds_the_same_solution(seed: int, iterations: int) -> Non
     assert found.eta == pytest.approx(direct.eta, rel=1e-3)
     assert np.abs(found.weights - direct.weights).sum() < 1e-3
     assert found.dual == pytest.approx(direct.dual, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("fraction", [0.9, 0.5, 0.3, 0.1])
+def test_the_fallback_finds_an_optimum_just_above_the_floor(seed: int, fraction: float) -> None:
+    problem = random_problem(seed)
+    direct = solve_dual(problem)
+    floored = replace(problem, eta_floor=fraction * direct.eta)
+    found = solve_dual(floored, max_iterations=1)
+    assert found.outcome is Outcome.FALLBACK
+    assert_optimal(floored, found)
+    assert found.eta == pytest.approx(direct.eta, rel=1e-3)
+
+
+@pytest.mark.parametrize("eta", [0.11, 0.15, 0.2, 0.24, 0.5])
+def test_equal_rewards_on_few_unbalanced_samples_are_solved_above_the_floor(eta: float) -> None:
+    # All Bellman errors are zero at first and the first Newton system is singular, so that this
+    # is a case for the fallback.  More features than samples: V alone must balance the samples.
+    differences = np.random.default_rng(0).normal(0.0, 0.5, size=(20, 30))
+    problem = DualProblem(np.zeros(20), differences, 9.0, 0.1 / 20, eta)
+    at_eta = solve_dual(problem)
+    assert at_eta.outcome is Outcome.AT_FLOOR
+    # With the KL found there as the bound, that temperature is optimal without any floor.
+    problem = replace(problem, kl_bound=at_eta.kl, eta_floor=0.1)
+    found = solve_dual(problem)
+    assert_optimal(problem, found)
+    assert found.eta == pytest.approx(eta, rel=1e-2)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -488,6 +525,4 @@ def test_rewards_that_move_with_a_potential_do_not_change_the_weights() -> None:
     # R + B theta_0 is undone by theta - theta_0 when the ridge is negligible.
     problem = random_problem(7, ridge=1e-10)
     shaped = replace(problem, rewards=problem.rewards + problem.differences @ np.linspace(-1, 1, 7))
-    np.testing.assert_allclose(
-        solve_dual(shaped).weights, solve_dual(problem).weights, atol=1e-5
-    )
+    np.testing.assert_allclose(solve_dual(shaped).weights, solve_dual(problem).weights, atol=1e-5)

@@ -96,7 +96,7 @@ def test_the_policy_loss_equals_that_of_refits_without_each_sample(actions: int)
     log_densities = []
     for i in range(20):
         rest = np.arange(20) != i
-        policy = CostSensitiveGP.fit(
+        policy = CostSensitiveGP(
             unit, kernel, x[rest], loss.targets[rest], loss.weights[rest], signal, noise
         )
         mean = policy.mean(x[i : i + 1])[0]
@@ -104,7 +104,7 @@ def test_the_policy_loss_equals_that_of_refits_without_each_sample(actions: int)
         z = (loss.targets[i] - mean) / sigma
         log_densities.append(np.sum(-0.5 * z**2 - np.log(sigma) - 0.5 * np.log(2.0 * np.pi)))
     wanted = -np.average(log_densities, weights=loss.weights)
-    assert loss(parameters)[0] == pytest.approx(wanted, rel=1e-9)
+    assert loss(parameters)[0] == pytest.approx(wanted, rel=1e-7)
 
 
 def test_factor_distances_stack_the_factors() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,8 @@ def gaussian_matrix(n: int, d: int, lengthscale: float, seed: int) -> FloatArray
     """A kernel matrix by the direct formula: eigenvalues that fall fast, as in the library."""
     x = np.random.default_rng(seed).normal(size=(n, d))
     squares = ((x[:, None] - x) ** 2).sum(axis=2)
-    return np.exp(-0.5 * squares / lengthscale**2)
+    gram: FloatArray = np.exp(-0.5 * squares / lengthscale**2)
+    return gram
 
 
 def factorise(
@@ -59,7 +62,7 @@ def test_cholesky_of_a_good_matrix_is_exact_and_reports_no_jitter() -> None:
 
 
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_cholesky_leaves_its_argument_alone(order: str) -> None:
+def test_cholesky_leaves_its_argument_alone(order: Literal["C", "F"]) -> None:
     a = np.array(positive_definite(12, seed=1), order=order)
     before = a.copy()
     cholesky(a)
@@ -130,7 +133,7 @@ def test_what_cannot_be_factorised_raises(a: FloatArray) -> None:
 
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("columns", [None, 1, 6])
-def test_triangular_solves(columns: int | None, order: str) -> None:
+def test_triangular_solves(columns: int | None, order: Literal["C", "F"]) -> None:
     lower = np.array(np.linalg.cholesky(positive_definite(15, seed=5)), order=order)
     shape = 15 if columns is None else (15, columns)
     b = np.random.default_rng(6).normal(size=shape)

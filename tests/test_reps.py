@@ -44,7 +44,9 @@ def collect(
             state = np.array([state[0] + 0.3 * velocity, velocity])
             observations.append(state)
             actions.append(action)
-        found.append(Rollout(np.array(observations), np.array(actions), np.array(rewards), terminated))
+        found.append(
+            Rollout(np.array(observations), np.array(actions), np.array(rewards), terminated)
+        )
     return found
 
 
@@ -77,11 +79,14 @@ def fingerprint(state: LearnerState) -> list[bytes]:
     assert state.policy is not None
     assert state.value is not None
     arrays = [
-        state.policy.support,
+        state.policy.states,
+        state.policy.targets,
+        state.policy.weights,
         state.policy.alpha,
-        state.policy.lower,
         state.policy.kernel.lengthscales,
-        np.array([state.policy.signal, state.policy.noise, state.policy.jitter]),
+        np.array([state.policy.signal, state.policy.noise]),
+        state.policy.predictor.mean_weights,
+        state.policy.predictor.explained,
         state.value.centres,
         state.value.alpha,
         state.value.kernel.lengthscales,
@@ -356,7 +361,7 @@ def test_a_periodic_coordinate_is_learnt_as_one() -> None:
     assert state.policy is not None
     assert state.value is not None
     query = np.random.default_rng(9).normal(size=(10, 2))
-    turned = query + [2.0 * np.pi, 0.0]
+    turned = query + np.array([2.0 * np.pi, 0.0])
     np.testing.assert_allclose(state.policy.mean(turned), state.policy.mean(query), atol=1e-8)
     np.testing.assert_allclose(state.value(turned), state.value(query), atol=1e-6)
 

@@ -56,7 +56,7 @@ def test_duplicated_states_add_no_feature() -> None:
 
 def test_the_value_function_is_the_product_of_features_and_theta() -> None:
     basis, features = RKHSBasis.fit(KERNEL, states(200, 5), tolerance=1e-5, max_rank=400)
-    theta = np.random.default_rng(6).normal(size=features.shape[1])
+    theta = np.random.default_rng(6).normal(size=(features.shape[1],))
     value = basis.value_function(theta)
     new = states(40, 7)
     np.testing.assert_allclose(value(new), basis.features(new) @ theta, atol=1e-8)
@@ -65,7 +65,7 @@ def test_the_value_function_is_the_product_of_features_and_theta() -> None:
 
 def test_the_squared_norm_of_the_value_function_is_that_of_theta() -> None:
     basis, features = RKHSBasis.fit(KERNEL, states(100, 8), tolerance=1e-4, max_rank=400)
-    theta = np.random.default_rng(9).normal(size=features.shape[1])
+    theta = np.random.default_rng(9).normal(size=(features.shape[1],))
     value = basis.value_function(theta)
     norm = value.alpha @ KERNEL.gram(value.centres) @ value.alpha
     assert norm == pytest.approx(theta @ theta, rel=1e-8)
@@ -75,8 +75,9 @@ def test_the_value_function_is_periodic_where_its_kernel_is() -> None:
     basis, features = RKHSBasis.fit(KERNEL, states(100, 10), tolerance=1e-4, max_rank=400)
     value = basis.value_function(np.ones(features.shape[1]))
     new = states(20, 11)
-    np.testing.assert_allclose(value(new + [2.0 * np.pi, 0.0]), value(new), atol=1e-7)
-    assert not np.allclose(value(new + [0.0, 2.0 * np.pi]), value(new))
+    turn = 2.0 * np.pi * np.eye(2)
+    np.testing.assert_allclose(value(new + turn[0]), value(new), atol=1e-7)
+    assert not np.allclose(value(new + turn[1]), value(new))
 
 
 def test_a_grid_of_radial_basis_functions() -> None:

@@ -1,10 +1,12 @@
-"""The command line: kreps train | resume | evaluate | plot | video."""
+"""The command line: kreps train | resume | evaluate | plot | video | reproduce."""
 
 from __future__ import annotations
 
 import json
 import sys
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +20,9 @@ from kreps.controller import Policy
 from kreps.data import TaskSpec
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import ConfigurationError, EnvironmentFailure, KrepsError
-from kreps.evaluation import Evaluation, Greedy, evaluate
+from kreps.evaluation import Evaluation, evaluate, stochastic_and_greedy
+from kreps.experiments.runner import cells_of, commit, run_cells, write_results
+from kreps.experiments.specs import EXPERIMENTS
 from kreps.learner import KREPS
 from kreps.rollout import Environment
 from kreps.runs import RunConfig, RunFolder
@@ -153,6 +157,62 @@ def video(
     console.print(f"filmed {_film(folder, _learnt(folder), steps, stochastic, seed, out)}")
 
 
+@app.command(
+    epilog="Examples:\n\n"
+    "  kreps reproduce swing-up --trials 10 --workers 2\n\n"
+    "  kreps reproduce swing-up --trials 2 --iterations 5 --out /tmp/small"
+)
+def reproduce(
+    experiment: Annotated[str, typer.Argument(help=f"One of: {', '.join(EXPERIMENTS)}.")],
+    trials: Annotated[int, typer.Option(min=1, help="Seeds 0 to TRIALS - 1.")] = 10,
+    workers: Annotated[int, typer.Option(min=1, help="Processes side by side.")] = 2,
+    iterations: Annotated[
+        int | None, typer.Option(min=1, help="Policy updates; the experiment's own if not given.")
+    ] = None,
+    out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("results"),
+) -> None:
+    """Repeat a comparison over many seeds and draw its figure.
+
+    Each cell (method x seed) is kept when it is done: stop at any time and call it again.
+    """
+    from kreps import plotting
+
+    if experiment not in EXPERIMENTS:
+        raise ConfigurationError(
+            f"experiment {experiment!r} is unknown; choose one of {', '.join(EXPERIMENTS)}"
+        )
+    spec = EXPERIMENTS[experiment]
+    command = f"kreps reproduce {experiment} --trials {trials}"
+    if iterations is not None:
+        command += f" --iterations {iterations}"
+    cells = cells_of(spec, trials, iterations)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as executor:
+        rows = run_cells(cells, executor, out / "cells" / experiment)
+    summary = write_results(out, experiment, command, spec, rows)
+    figure = plotting.comparison(
+        rows,
+        REFERENCE_REWARDS.get(spec.environment, {}),
+        f"{spec.environment}: every seed",
+        f"{command}   (commit {commit()})",
+    )
+    table = Table(title=f"{experiment}: average reward per step after the last update")
+    for heading in ("method", "stochastic", "worst seed", "greedy", "worst seed"):
+        table.add_column(heading)
+    for method, entry in summary.items():
+        columns = [
+            text
+            for name in ("stochastic", "greedy")
+            for text in (
+                f"{entry[name]['mean']:.2f} ± {entry[name]['two_standard_errors']:.2f}",
+                f"{entry[name]['worst']:.2f}",
+            )
+        ]
+        table.add_row(method, *columns)
+    console.print(table)
+    console.print(f"Results:   {out / experiment}.csv, {out / experiment}.json")
+    console.print(f"Figure:    {plotting.save(figure, out / f'{experiment}.png')}")
+
+
 def main() -> None:
     """Entry point: errors of the library come out as one line, not as a traceback."""
     try:
@@ -268,7 +328,10 @@ def _in_words(environment: str, reward: float) -> str:
     (best_name, best), *others = references.items()
     worst_name, worst = others[-1]
     way = (reward - worst) / (best - worst)
-    text = f" That is {way:.0%} of the way from {worst_name} ({worst:g}) to the {best_name} ({best:g})."
+    text = (
+        f" That is {way:.0%} of the way from {worst_name} ({worst:g}) "
+        f"to the {best_name} ({best:g})."
+    )
     for name, value in others[:-1]:
         if abs(reward - value) < 0.05 * abs(best - worst):
             text += f" It is near {name} ({value:g}): the run is probably stuck there."
@@ -279,10 +342,9 @@ def _evaluate(
     folder: RunFolder, learner: KREPS, episodes: int, steps: int, seed: int
 ) -> dict[str, Evaluation]:
     assert learner.env is not None and learner.state.policy is not None
-    policies = {"stochastic": learner.state.policy, "greedy": Greedy(learner.state.policy)}
     found = {}
     with console.status("evaluating ..."), blas_threads(1):
-        for name, policy in policies.items():
+        for name, policy in stochastic_and_greedy(learner.state.policy).items():
             found[name] = evaluate(
                 learner.env,
                 learner.task,

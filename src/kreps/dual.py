@@ -265,23 +265,26 @@ def _newton(
 def _bisection(problem: DualProblem, stalled: _Progress) -> _Progress:
     """Newton in theta inside a bisection on log eta: slow and sure, as KL falls with eta."""
     iterations, jitter = stalled.iterations, stalled.jitter
-    low = max(problem.eta_floor, 1e-8)
-    high, theta = 1e3, np.zeros_like(stalled.theta)
-    end = stalled
-    for trial in range(60):
-        # The floor first, as an active floor needs no search at all.
-        eta = low if trial == 0 else float(np.sqrt(low * high))
-        end = _newton(problem, eta, theta, 200, eta_free=False)
+    low, high = 0.0, np.inf  # KL is too large at low, too small at high
+    eta, theta, end = stalled.eta, stalled.theta, stalled
+    for _ in range(80):
+        end = _newton(problem, eta, theta, 100, eta_free=False)
         iterations += end.iterations
         jitter = max(jitter, end.jitter)
         theta = end.theta
         g_eta, _ = dual_gradient(problem, eta, theta)
-        if abs(g_eta) <= KL_TOLERANCE * problem.kl_bound or (trial == 0 and g_eta > 0):
-            break
+        at_floor = eta <= problem.eta_floor and g_eta >= 0
+        if at_floor or abs(g_eta) <= KL_TOLERANCE * problem.kl_bound:
+            return _Progress(eta, theta, end.decrement, iterations, jitter, end.converged)
         if g_eta < 0:
             low = eta
         else:
             high = eta
-    else:
-        return _Progress(eta, theta, end.decrement, iterations, jitter, False)
-    return _Progress(eta, theta, end.decrement, iterations, jitter, end.converged)
+        # widen geometrically until the solution is bracketed, then halve in the logarithm
+        if np.isinf(high):
+            eta = 4.0 * low
+        elif low == 0.0:
+            eta = max(0.25 * high, problem.eta_floor)
+        else:
+            eta = float(np.sqrt(low * high))
+    return _Progress(eta, theta, end.decrement, iterations, jitter, False)

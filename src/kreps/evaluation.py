@@ -75,6 +75,11 @@ def discounted_average(rollouts: Sequence[Rollout], restart_probability: float) 
     )
 
 
+def stochastic_and_greedy(policy: CostSensitiveGP) -> dict[str, StochasticPolicy]:
+    """The two ways in which every learnt policy is judged, by name."""
+    return {"stochastic": policy, "greedy": Greedy(policy)}
+
+
 def evaluate(
     env: Environment,
     task: TaskSpec,

@@ -7,6 +7,7 @@ Both criteria depend on their parameters through one matrix ``C = K + noise`` an
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -96,9 +97,7 @@ class PolicyLoss:
         e = alpha / kappa[:, None]
         squares = np.einsum("ij,ij->i", e, e)
         variance = 1.0 / kappa + noise * (1.0 - 1.0 / self.weights)
-        value = share @ (
-            0.5 * actions * np.log(2.0 * np.pi * variance) + 0.5 * squares / variance
-        )
+        value = share @ (0.5 * actions * np.log(2.0 * np.pi * variance) + 0.5 * squares / variance)
         by_variance = 0.5 * share * (actions - squares / variance) / variance
         # d value = <dC, M> + (the noise's own share in the variance)
         a = (share / variance / kappa)[:, None] * e
@@ -113,7 +112,9 @@ class PolicyLoss:
         gradient.append(float(weighted.sum()))
         gradient.append(
             noise
-            * float(np.diagonal(m) @ (1.0 / self.weights) + by_variance @ (1.0 - 1.0 / self.weights))
+            * float(
+                np.diagonal(m) @ (1.0 / self.weights) + by_variance @ (1.0 - 1.0 / self.weights)
+            )
         )
         return float(value), np.array(gradient)
 
@@ -146,7 +147,7 @@ def minimise(
 ) -> FloatArray:
     """Parameters of least loss plus prior within the prior's box, from ``start`` (L-BFGS-B)."""
 
-    def objective(x: FloatArray) -> tuple[float, FloatArray]:
+    def objective(x: Any) -> tuple[float, Any]:
         try:
             value, gradient = loss(x)
         except NumericalError:  # a step too far: tell the line search so
@@ -159,7 +160,7 @@ def minimise(
         np.clip(start, prior.low, prior.high),
         jac=True,
         method="L-BFGS-B",
-        bounds=np.stack([prior.low, prior.high], axis=1),
+        bounds=list(zip(prior.low, prior.high, strict=True)),
         options={"maxiter": max_iterations, "ftol": 1e-5},
     )
     return np.asarray(found.x, dtype=np.float64)

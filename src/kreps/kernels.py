@@ -83,7 +83,7 @@ class Kernel:
         )
 
     def gram(self, x: FloatArray, y: FloatArray | None = None) -> FloatArray:
-        """Gram matrix ``[k(x_i, y_j)]`` (n, k) of inputs (n, d) and (k, d); ``y`` None means ``x``."""
+        """``[k(x_i, y_j)]``, (n, k), for inputs (n, d) and (k, d); ``y`` None means ``x``."""
         return gaussian_gram(self.embed(x), None if y is None else self.embed(y))
 
 

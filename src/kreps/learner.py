@@ -157,7 +157,9 @@ class KREPS:
         assert self.env is not None
         for _ in range(iterations):
             first = self.state.iteration == 0
-            count = self.settings.initial_rollouts if first else self.settings.rollouts_per_iteration
+            count = (
+                self.settings.initial_rollouts if first else self.settings.rollouts_per_iteration
+            )
             started = time.process_time()
             with blas_threads(self.threads):
                 rollouts = collect(

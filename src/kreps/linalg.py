@@ -27,7 +27,7 @@ class Cholesky:
     def solve(self, b: FloatArray) -> FloatArray:
         """``A^-1 b`` for ``b`` of shape (n,) or (n, k)."""
         x, _ = lapack.dpotrs(self.lower, b, lower=1)
-        return x  # type: ignore[no-any-return]
+        return x
 
     def inverse(self) -> FloatArray:
         """``A^-1``, (n, n) and symmetric."""
@@ -62,15 +62,15 @@ def cholesky(a: FloatArray) -> Cholesky:
 def solve_lower(lower: FloatArray, b: FloatArray) -> FloatArray:
     """``L^-1 b`` for lower triangular ``L`` (n, n) and ``b`` (n,) or (n, k)."""
     if b.ndim == 1 or b.shape[1] == 1:  # the control loop: no threads, no blocking
-        return blas.dtrsv(lower, b.ravel(), lower=1).reshape(b.shape)  # type: ignore[no-any-return]
-    return blas.dtrsm(1.0, lower, b, lower=1)  # type: ignore[no-any-return]
+        return blas.dtrsv(lower, b.ravel(), lower=1).reshape(b.shape)
+    return blas.dtrsm(1.0, lower, b, lower=1)
 
 
 def solve_lower_transposed(lower: FloatArray, b: FloatArray) -> FloatArray:
     """``L'^-1 b`` for lower triangular ``L`` (n, n) and ``b`` (n,) or (n, k)."""
     if b.ndim == 1:
-        return blas.dtrsv(lower, b, lower=1, trans=1)  # type: ignore[no-any-return]
-    return blas.dtrsm(1.0, lower, b, lower=1, trans_a=1)  # type: ignore[no-any-return]
+        return blas.dtrsv(lower, b, lower=1, trans=1)
+    return blas.dtrsm(1.0, lower, b, lower=1, trans_a=1)
 
 
 @dataclass(frozen=True)

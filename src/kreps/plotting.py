@@ -1,4 +1,4 @@
-"""Pictures of a run.  Everything is drawn from what the run wrote; nothing is computed anew but maps."""
+"""Pictures, drawn from what runs and experiments wrote."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
 from kreps.errors import ConfigurationError
 
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -64,7 +64,9 @@ def learning_curve(
     with rc_context(STYLE):
         figure = Figure(figsize=(7.0, 6.0))
         top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(4, 1, 1))
-        top.plot(known, column("average_reward"), "o-", color=BLUE, ms=4, label="training roll-outs")
+        top.plot(
+            known, column("average_reward"), "o-", color=BLUE, ms=4, label="training roll-outs"
+        )
         if evaluation:
             for name, marker in (("stochastic", "D"), ("greedy", "*")):
                 top.plot(
@@ -91,19 +93,19 @@ def learning_curve(
 
 
 def draw_references(axes: Axes, references: Mapping[str, float]) -> None:
-    """A dashed line per value, its name above it; below where the line above is too near."""
+    """A dashed line per value, named on the right; lower where the line above is too near."""
     spread = max(references.values(), default=0.0) - min(references.values(), default=0.0)
     above = np.inf
     for name, value in sorted(references.items(), key=lambda item: -item[1]):
         near = above - value < 0.05 * spread
         axes.axhline(value, color=GREY, lw=0.8, ls="--", zorder=0)
         axes.annotate(
-            f"{name} {value:g}",
-            (0.01, value),
+            f"{name.replace(' (', chr(10) + '(')}  {value:g}",
+            (1.0, value),
             xycoords=("axes fraction", "data"),
-            xytext=(0, -2 if near else 2),
+            xytext=(4, 0),
             textcoords="offset points",
-            va="top" if near else "bottom",
+            va="top" if near else "center",
             color=GREY,
             fontsize=7.5,
         )
@@ -195,14 +197,13 @@ def film(
             if plane:
                 trail.set_data(*_unwrapped(observations[: t + 1], task))
                 dot.set_data(observations[t : t + 1, 0], observations[t : t + 1, 1])
-            canvas.draw()
-            images.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy()))
+            canvas.draw()  # type: ignore[no-untyped-call]
+            pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+            images.append(Image.fromarray(pixels[..., :3].copy()))
     # one palette without dithering: neighbouring pictures then differ only where things move
     palette = images[len(images) // 2].quantize(96, dither=Image.Dither.NONE)
     still = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    still[0].save(
-        path, save_all=True, append_images=still[1:], duration=round(1000 / fps), loop=0
-    )
+    still[0].save(path, save_all=True, append_images=still[1:], duration=round(1000 / fps), loop=0)
     return path
 
 
@@ -270,3 +271,54 @@ def _label_axes(axes: Axes, task: TaskSpec, labels: Sequence[str]) -> None:
         low, high = axes.get_xlim()
         inside = [i for i, t in enumerate(ticks) if low - 1e-9 <= t <= high + 1e-9]
         axes.set_xticks(ticks[inside], [names[i] for i in inside])
+
+
+def comparison(
+    rows: Sequence[Mapping[str, Any]], references: Mapping[str, float], title: str, source: str
+) -> Figure:
+    """Every seed of every method against environment steps, stochastic above greedy, and means.
+
+    Args:
+        rows: of an experiment, one per method, seed and iteration.
+        references: values to draw as lines, by name.
+        title: of the figure.
+        source: command and commit that made it, printed below.
+    """
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    with rc_context(STYLE):
+        figure = Figure(figsize=(4.6 * len(methods) + 1.4, 6.4))
+        plots = figure.subplots(2, len(methods), sharex=True, sharey=True, squeeze=False)
+        for column, method in enumerate(methods):
+            mine = [row for row in rows if row["method"] == method]
+            for axes, name in zip(plots[:, column], ("stochastic", "greedy"), strict=True):
+                _draw_seeds(axes, mine, name)
+                draw_references(axes, references if column == len(methods) - 1 else {})
+                for value in references.values():
+                    axes.axhline(value, color=GREY, lw=0.8, ls="--", zorder=0)
+                axes.set_title(f"{method}, {name} policy")
+        for axes in plots[:, 0]:
+            axes.set_ylabel("average reward per step")
+        for axes in plots[-1]:
+            axes.set_xlabel("environment steps")
+        figure.suptitle(title, fontweight="bold")
+        figure.supxlabel(source, fontsize=6.5, color=GREY)
+    return figure
+
+
+def _draw_seeds(axes: Axes, rows: Sequence[Mapping[str, Any]], name: str) -> None:
+    seeds = sorted({row["seed"] for row in rows})
+    curves = []
+    for seed in seeds:
+        mine = sorted((r for r in rows if r["seed"] == seed), key=lambda r: r["iteration"])
+        curves.append(([r["steps"] for r in mine], [r[name] for r in mine]))
+        axes.plot(*curves[-1], color=BLUE, lw=0.7, alpha=0.45)
+    steps = np.mean([c[0] for c in curves], axis=0)
+    values = np.array([c[1] for c in curves])
+    mean = values.mean(axis=0)
+    axes.plot(steps, mean, color=ORANGE, lw=2, label=f"mean of {len(seeds)} seeds")
+    if len(seeds) > 1:
+        band = 2 * values.std(axis=0, ddof=1) / np.sqrt(len(seeds))
+        axes.fill_between(
+            steps, mean - band, mean + band, color=ORANGE, alpha=0.25, lw=0, label="± 2 s.e."
+        )
+    axes.legend(loc="lower right")

@@ -31,7 +31,7 @@ class StochasticPolicy(Protocol):
 
 @dataclass(frozen=True)
 class BangBang:
-    """Each action at one of its limits, with random sign: what bounded control mostly looks like."""
+    """Each action at one of its limits, with random sign: what bounded control often is."""
 
     task: TaskSpec
 
@@ -167,7 +167,7 @@ class Predictor:
         columns = policy.signal * chosen.columns
         mean_weights = solve_lower_transposed(lower, columns.T @ policy.alpha)
         # k' C^-1 k = |L^-1 columns phi|^2 = |R phi|^2 with R from the QR of L^-1 columns
-        r = np.linalg.qr(solve_lower(policy.factor.lower, columns), mode="r")
+        r: FloatArray = np.linalg.qr(solve_lower(policy.factor.lower, columns), mode="r")  # type: ignore[assignment]
         return cls(
             kernel,
             kernel.embed(states[chosen.pivots]),

@@ -149,16 +149,16 @@ def _simulate_batch(
         live = np.flatnonzero(ends > t)
         if len(live) == 0:
             break
-        noise = np.array([noises[j].standard_normal(task.action_size) for j in live])
+        noise = np.array([noises[int(j)].standard_normal(task.action_size) for j in live])
         actions[t, live] = policy.act(observations[t, live], noise)
         observations[t + 1, live], rewards[t, live], done = model.step(
-            observations[t, live], task.clip(actions[t, live]), [rngs[j] for j in live]
+            observations[t, live], task.clip(actions[t, live]), [rngs[int(j)] for j in live]
         )
         ends[live[done]] = t + 1
         terminated[live[done]] = True
     return [
         Rollout(observations[: end + 1, j], actions[:end, j], rewards[:end, j], bool(terminated[j]))
-        for j, end in enumerate(ends)
+        for j, end in enumerate(ends.tolist())
     ]
 
 
@@ -196,9 +196,7 @@ def _simulate_one(
             "environment and call learn() again"
         ) from error
     try:
-        rollout = Rollout(
-            np.stack(observations), np.stack(actions), np.array(rewards), terminated
-        )
+        rollout = Rollout(np.stack(observations), np.stack(actions), np.array(rewards), terminated)
         rollout.check(task)
     except (ValueError, DataError) as error:
         raise DataError(f"roll-out {number} of the environment: {error}") from error

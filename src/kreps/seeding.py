@@ -28,7 +28,7 @@ def _sequence(seed: int, purpose: Purpose, indices: tuple[int, ...]) -> np.rando
 
 
 def generator(seed: int, purpose: Purpose, *indices: int) -> np.random.Generator:
-    """The generator of one purpose, e.g. ``generator(seed, Purpose.POLICY, iteration, rollout)``."""
+    """The generator of one purpose: ``generator(seed, Purpose.POLICY, iteration, rollout)``."""
     return np.random.Generator(np.random.PCG64(_sequence(seed, purpose, indices)))
 
 

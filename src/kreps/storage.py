@@ -46,9 +46,11 @@ def write_atomically(path: Path, content: bytes) -> None:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(beside, path)
+        beside.replace(path)
     except OSError as error:
-        raise StorageError(f"cannot write {path}: {error}; check the folder and its space") from error
+        raise StorageError(
+            f"cannot write {path}: {error}; check the folder and its space"
+        ) from error
 
 
 def write_arrays(path: Path, kind: str, tensors: Tensors, header: Header) -> None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from kreps.arrays import FloatArray
+from kreps.arrays import FloatArray, IntArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window
 from kreps.dual import (
     DualProblem,
@@ -249,9 +249,7 @@ def feature_differences(
     """
     start = features[data.start].mean(axis=0)
     return (
-        (1.0 - restart_probability) * expected
-        + restart_probability * start
-        - features[data.state]
+        (1.0 - restart_probability) * expected + restart_probability * start - features[data.state]
     )
 
 
@@ -331,7 +329,7 @@ def fit_policy(
     )
 
 
-def random_rows(n: int, rng: np.random.Generator) -> FloatArray:
+def random_rows(n: int, rng: np.random.Generator) -> IntArray:
     """At most `FIT_SAMPLE` row numbers out of n, in order."""
     if n <= FIT_SAMPLE:
         return np.arange(n)

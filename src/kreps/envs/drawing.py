@@ -1,4 +1,4 @@
-"""Anti-aliased discs and rods for ``rgb_array`` rendering: two distance functions, no dependency."""
+"""Anti-aliased discs and rods for ``rgb_array`` rendering, by distance to a line."""
 
 from __future__ import annotations
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -138,7 +138,7 @@ class SwingUp(gym.Env[FloatArray, FloatArray]):
     * v0: Initial version.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {
+    metadata: dict[str, Any] = {  # noqa: RUF012 (declared so by gymnasium.Env)
         "render_modes": ["rgb_array"],
         "render_fps": round(1.0 / TIME_STEP),
         "periodic_coordinates": (0,),

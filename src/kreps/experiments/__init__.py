@@ -1,0 +1,1 @@
+"""Comparisons over many seeds: what is compared, how it is run, what is written."""
