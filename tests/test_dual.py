@@ -453,7 +453,8 @@ def test_equal_rewards_on_few_unbalanced_samples_are_solved_above_the_floor(eta:
     problem = replace(problem, kl_bound=at_eta.kl, eta_floor=0.1)
     found = solve_dual(problem)
     assert_optimal(problem, found)
-    assert found.eta == pytest.approx(eta, rel=1e-2)
+    # KL hardly depends on the temperature here, so its tolerance leaves some room.
+    assert found.eta == pytest.approx(eta, rel=5e-2)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -8,6 +8,7 @@ from typing import Any, Literal, get_args
 from kreps.errors import ConfigurationError
 
 Model = Literal["embedding", "sample"]
+Features = Literal["rkhs", "grid"]
 PolicyFit = Literal["map", "bounded"]
 Exploration = Literal["bang-bang", "gaussian"]
 
@@ -23,6 +24,8 @@ class Settings:
             bound go slack instead.  0 gives the paper's update.
         ridge: rho times the number of samples; the softness of the stationarity constraint.
         model: transition model, ``"embedding"`` (Eq. 4) or ``"sample"`` (the observed successor).
+        features: of V, ``"rkhs"`` (Eq. 3) or ``"grid"`` (fixed radial basis functions).
+        grid_size: centres per coordinate of the grid.
         policy_fit: ``"map"``, maximum a posteriori hyper-parameters of the policy, or
             ``"bounded"``, maximum likelihood within hard ranges.
         exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``.
@@ -39,6 +42,8 @@ class Settings:
     eta_floor: float = 0.1
     ridge: float = 0.1
     model: Model = "embedding"
+    features: Features = "rkhs"
+    grid_size: int = 10
     policy_fit: PolicyFit = "map"
     exploration: Exploration = "bang-bang"
     exploration_scale: float = 1.0
@@ -52,6 +57,7 @@ class Settings:
     def __post_init__(self) -> None:
         for name, kind in (
             ("model", Model),
+            ("features", Features),
             ("policy_fit", PolicyFit),
             ("exploration", Exploration),
         ):
@@ -64,7 +70,13 @@ class Settings:
             _require(name, getattr(self, name), "positive", lambda v: 0 < v < float("inf"))
         _require("eta_floor", self.eta_floor, "zero or positive", lambda v: 0 <= v < float("inf"))
         _require("restart_probability", self.restart_probability, "in (0, 1)", lambda v: 0 < v < 1)
-        for name in ("initial_rollouts", "rollouts_per_iteration", "window", "max_rank"):
+        for name in (
+            "initial_rollouts",
+            "rollouts_per_iteration",
+            "window",
+            "max_rank",
+            "grid_size",
+        ):
             _require(name, getattr(self, name), "a whole number >= 1", lambda v: v >= 1, int)
 
 

@@ -12,12 +12,21 @@ from typing import Protocol
 import numpy as np
 
 from kreps.arrays import FloatArray
-from kreps.kernels import Kernel
+from kreps.errors import ConfigurationError
+from kreps.kernels import Factor, Kernel, Periodic
 from kreps.linalg import pivoted_cholesky, solve_lower, solve_lower_transposed
+
+MAX_CENTRES = 4096
+"""Most centres of a grid: the dual costs their cube."""
 
 
 class Basis(Protocol):
     """Features of the value function."""
+
+    @property
+    def residual(self) -> float:
+        """Largest squared residual of a sampled state's kernel function; 0 for fixed features."""
+        ...
 
     def value_function(self, theta: FloatArray) -> ValueFunction:
         """``V(s) = phi(s)' theta`` as a kernel expansion, for ``theta`` of shape (r,)."""
@@ -86,6 +95,38 @@ class RBFGrid:
 
     kernel: Kernel
     centres: FloatArray
+    residual: float = 0.0
+
+    @classmethod
+    def over(
+        cls, factors: tuple[Factor, ...], points: FloatArray, size: int
+    ) -> tuple[RBFGrid, FloatArray]:
+        """``size`` centres per coordinate over the range of ``points`` (m, ds), and their features.
+
+        The spacing is the lengthscale.  Periodic coordinates get a whole turn.
+
+        Raises:
+            ConfigurationError: more than `MAX_CENTRES` centres.
+        """
+        dimension = points.shape[1]
+        if size**dimension > MAX_CENTRES:
+            raise ConfigurationError(
+                f"a grid of {size} centres in each of {dimension} coordinates has "
+                f"{float(size) ** dimension:.3g} centres, the limit is {MAX_CENTRES}; "
+                'use features="rkhs", which needs no grid'
+            )
+        axes, lengthscales = [], []
+        for i, factor in enumerate(factors):
+            if isinstance(factor, Periodic):
+                axes.append(np.arange(size) * 2.0 * np.pi / size)
+                lengthscales.append(2.0 * np.sin(np.pi / size))  # the chord of the spacing
+            else:
+                low, high = points[:, i].min(), points[:, i].max()
+                axes.append(np.linspace(low, high, size))
+                lengthscales.append((high - low) / max(size - 1, 1) or 1.0)
+        centres = np.stack([axis.ravel() for axis in np.meshgrid(*axes)], axis=1)
+        grid = cls(Kernel(factors, np.array(lengthscales)), centres)
+        return grid, grid.features(points)
 
     def features(self, states: FloatArray) -> FloatArray:
         """``phi``, (m, r), at states (m, ds)."""

@@ -29,7 +29,7 @@ from kreps.hyperparameters import (
 from kreps.kernels import Kernel, SquaredExponential, factors_of, median_lengthscales
 from kreps.policies import CostSensitiveGP
 from kreps.settings import Settings
-from kreps.value import RKHSBasis, ValueFunction
+from kreps.value import Basis, RBFGrid, RKHSBasis, ValueFunction
 
 FIT_SAMPLE = 400
 """Samples on which hyper-parameters are fitted: the cost is cubic, the estimate hardly better."""
@@ -127,7 +127,8 @@ def update(
     clock = _Stopwatch()
 
     # Eq. 3: a basis of V, chosen among the sampled states
-    kernel, basis, features = value_basis(data, task, settings, rng)
+    kernel = state_kernel(data, task, rng)
+    basis, features = value_basis(data, kernel, settings)
     clock.lap("basis")
 
     # Eq. 4: expected features of each successor
@@ -189,16 +190,19 @@ def update(
     return new_state, info
 
 
-def value_basis(
-    data: Transitions, task: TaskSpec, settings: Settings, rng: np.random.Generator
-) -> tuple[Kernel, RKHSBasis, FloatArray]:
-    """V's kernel at the median lengthscales, its basis, and the features (m, r) of all points."""
+def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) -> Kernel:
+    """The kernel over states at the median lengthscales."""
     factors = factors_of(task.observation_size, task.periodic)
-    kernel = Kernel(factors, median_lengthscales(factors, data.points, rng))
-    basis, features = RKHSBasis.fit(
+    return Kernel(factors, median_lengthscales(factors, data.points, rng))
+
+
+def value_basis(data: Transitions, kernel: Kernel, settings: Settings) -> tuple[Basis, FloatArray]:
+    """The basis of V, and the features (m, r) of all points."""
+    if settings.features == "grid":
+        return RBFGrid.over(kernel.factors, data.points, settings.grid_size)
+    return RKHSBasis.fit(
         kernel, data.points, tolerance=settings.basis_tolerance, max_rank=settings.max_rank
     )
-    return kernel, basis, features
 
 
 def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
