@@ -172,11 +172,12 @@ class _Progress:
 
 
 DECREMENT_TOLERANCE = 1e-9
-KL_TOLERANCE = 1e-4
-"""Relative to the bound.  The decrement alone lies as eta -> 0, where the curvature explodes."""
+GAP_TOLERANCE = 1e-6
+KL_TOLERANCE = 1e-4  # relative to the bound
+"""All three are asked for: the decrement alone lies as eta -> 0, where the curvature explodes."""
 
 
-def solve_dual(problem: DualProblem, max_iterations: int = 60) -> DualSolution:
+def solve_dual(problem: DualProblem, max_iterations: int = 40) -> DualSolution:
     """Minimise the dual over eta >= floor and theta: damped Newton, with bisection to fall back on.
 
     Args:
@@ -188,7 +189,7 @@ def solve_dual(problem: DualProblem, max_iterations: int = 60) -> DualSolution:
     end = _newton(problem, start, zero, max_iterations, eta_free=True)
     outcome = Outcome.BOUND_ACTIVE
     if not end.converged:
-        end = _bisection(problem, end)
+        end = _bisection(problem)
         outcome = Outcome.FALLBACK if end.converged else Outcome.NOT_CONVERGED
     if end.converged and end.eta <= problem.eta_floor:
         outcome = Outcome.AT_FLOOR
@@ -242,7 +243,8 @@ def _newton(
         slope = float(g_theta @ step) + eta * g_eta * stretch
         decrement = -0.5 * slope
         kl_met = not moves_eta or abs(g_eta) <= KL_TOLERANCE * problem.kl_bound
-        if decrement <= DECREMENT_TOLERANCE and kl_met:
+        gap = float(g_theta @ g_theta) / (2.0 * problem.ridge)
+        if decrement <= DECREMENT_TOLERANCE and gap <= GAP_TOLERANCE and kl_met:
             return _Progress(eta, theta, decrement, iteration, jitter, True)
         least = max(0.5, floor / eta) - 1.0  # eta at most halves and never passes its floor
         length = 1.0 if stretch >= least else least / stretch
@@ -262,16 +264,21 @@ def _newton(
     return _Progress(eta, theta, decrement, max_iterations, jitter, False)
 
 
-def _bisection(problem: DualProblem, stalled: _Progress) -> _Progress:
-    """Newton in theta inside a bisection on log eta: slow and sure, as KL falls with eta."""
-    iterations, jitter = stalled.iterations, stalled.jitter
+def _bisection(problem: DualProblem) -> _Progress:
+    """Newton in theta along a path of temperatures: slow and sure, as KL falls with eta.
+
+    From eta = 1 the temperature is halved (or doubled) until the KL bound is passed, then
+    bisected in the logarithm.  Each solve starts from the one before, so none has far to go.
+    """
+    eta, theta = max(1.0, problem.eta_floor), np.zeros(problem.differences.shape[1])
     low, high = 0.0, np.inf  # KL is too large at low, too small at high
-    eta, theta, end = stalled.eta, stalled.theta, stalled
-    for _ in range(80):
+    iterations, jitter = 0, 0.0
+    end = _Progress(eta, theta, np.inf, 0, 0.0, False)
+    for _ in range(100):
         end = _newton(problem, eta, theta, 100, eta_free=False)
+        theta = end.theta
         iterations += end.iterations
         jitter = max(jitter, end.jitter)
-        theta = end.theta
         g_eta, _ = dual_gradient(problem, eta, theta)
         at_floor = eta <= problem.eta_floor and g_eta >= 0
         if at_floor or abs(g_eta) <= KL_TOLERANCE * problem.kl_bound:
@@ -280,11 +287,10 @@ def _bisection(problem: DualProblem, stalled: _Progress) -> _Progress:
             low = eta
         else:
             high = eta
-        # widen geometrically until the solution is bracketed, then halve in the logarithm
         if np.isinf(high):
-            eta = 4.0 * low
+            eta *= 2.0
         elif low == 0.0:
-            eta = max(0.25 * high, problem.eta_floor)
+            eta = max(0.5 * eta, problem.eta_floor)
         else:
             eta = float(np.sqrt(low * high))
     return _Progress(eta, theta, end.decrement, iterations, jitter, False)

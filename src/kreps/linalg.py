@@ -16,6 +16,9 @@ from kreps.errors import NumericalError
 
 _JITTERS = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)
 
+_ROUNDING = 1e-14
+"""Residuals below this share of the diagonal are rounding errors and make no pivots."""
+
 
 @dataclass(frozen=True)
 class Cholesky:
@@ -111,8 +114,9 @@ def pivoted_cholesky(
     """
     n = len(diagonal)
     max_rank = min(max_rank, n)
-    columns = np.zeros((n, max_rank), order="F")
     left = diagonal.astype(np.float64, copy=True)
+    tolerance = max(tolerance, _ROUNDING * float(left.max(initial=0.0)))
+    columns = np.zeros((n, max_rank), order="F")
     pivots = np.empty(max_rank, dtype=np.intp)
     rank = 0
     while rank < max_rank and left.max() > tolerance:
@@ -121,6 +125,9 @@ def pivoted_cholesky(
         candidates = candidates[np.lexsort((candidates, -left[candidates]))]
         fresh = block_of(candidates) - columns[:, :rank] @ columns[candidates, :rank].T
         local, order, kept, _ = lapack.dpstrf(fresh[candidates], tol=tolerance, lower=1)
+        if kept == 0:  # what seemed left of them was rounding
+            left[candidates] = 0.0
+            continue
         # A candidate close to an earlier one is left for a later round, where a better row
         # than it may have turned up: this keeps the trace near that of one-by-one pivoting.
         pivot_sizes = np.diagonal(local)[:kept] ** 2

@@ -80,9 +80,8 @@ class SwingUp(gym.Env[FloatArray, FloatArray]):
 
     A pendulum hangs from a driven joint and is to be swung up and held upright.  The motor is
     too weak to lift it directly, so it must be swung back and forth to gain energy.  The torque
-    that acts is the commanded one, limited to what the motor gives, plus noise.  This is the
-    low-dimensional swing-up of "Learning of Non-Parametric Control Policies with High-Dimensional
-    State Features" and its companion paper.
+    that acts is the commanded one, limited to what the motor gives, plus noise.  It is the
+    low-dimensional swing-up on which REPS with RKHS embeddings was introduced.
 
     The pendulum follows `I theta'' = G sin(theta) + u - k theta'` with inertia
     `I = m l^2 / 3` and weight `G = m g l`, for `m = 10 kg`, `l = 0.5 m`, `g = 9.81 m s^-2` and
