@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 from kreps.arrays import FloatArray
 from kreps.dual import (
     DECREMENT_TOLERANCE,
+    GAP_TOLERANCE,
     KL_TOLERANCE,
     DualProblem,
     DualSolution,
@@ -66,6 +67,7 @@ def assert_optimal(problem: DualProblem, found: DualSolution) -> None:
     assert found.stationarity == pytest.approx(np.linalg.norm(imbalance), abs=1e-12)
     # The Newton decrement bounds the gradient: g'g <= lambda_max g' H^-1 g.
     assert found.decrement <= DECREMENT_TOLERANCE
+    assert found.stationarity**2 <= 2.01 * problem.ridge * GAP_TOLERANCE
     steepest = np.linalg.eigvalsh(dual_hessian(problem, found.eta, found.theta)).max()
     assert found.stationarity <= 1.01 * np.sqrt(2.0 * DECREMENT_TOLERANCE * steepest)
     if found.outcome is Outcome.AT_FLOOR:

@@ -165,6 +165,13 @@ def test_squared_distances_of_a_squared_exponential(x: FloatArray) -> None:
     np.testing.assert_array_equal(np.diagonal(found), 0.0)
 
 
+def test_squared_distances_do_not_feel_a_large_common_offset() -> None:
+    x = np.round(np.random.default_rng(6).normal(size=(30, 2)) * 2**20) / 2**20
+    factor = SquaredExponential((0, 1))
+    wanted = squared_distances(factor, x)
+    np.testing.assert_allclose(squared_distances(factor, x + 1e6), wanted, atol=1e-8)
+
+
 @repeatable
 @given(inputs(2))
 def test_squared_distances_of_a_periodic_factor_are_those_of_chords(x: FloatArray) -> None:

@@ -7,13 +7,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.optimize
 
+from kreps.algorithms import reps
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
     LearnerState,
     PolicySamples,
     UpdateInfo,
     feature_differences,
+    policy_hyperparameters,
     successor_features,
     update,
 )
@@ -21,6 +24,7 @@ from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window
 from kreps.dual import KL_TOLERANCE, Outcome, kl_from_uniform
 from kreps.errors import DataError
+from kreps.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel, factors_of
 from kreps.settings import Settings, settings_of
 
@@ -123,6 +127,19 @@ def test_the_weights_move_as_far_as_the_bound_or_the_floor_permits(recipe: str, 
     assert (info.embedding_parameters is None) == (model == "sample")
 
 
+def test_fixed_features_are_a_grid_over_all_states() -> None:
+    settings = settings_of(features="grid", grid_size=6)
+    rollouts = collect()
+    state, info = run(rollouts, settings)
+    assert_bounded(info, settings)
+    assert info.rank == 36
+    assert info.rank_residual == 0.0
+    assert state.value is not None
+    points = np.concatenate([r.observations for r in rollouts])
+    np.testing.assert_allclose(state.value.centres.min(axis=0), points.min(axis=0))
+    np.testing.assert_allclose(state.value.centres.max(axis=0), points.max(axis=0))
+
+
 def test_a_high_floor_keeps_the_update_short_of_the_bound() -> None:
     settings = settings_of(kl_bound=3.0, eta_floor=2.0)
     _, info = run(collect(), settings)
@@ -131,12 +148,13 @@ def test_a_high_floor_keeps_the_update_short_of_the_bound() -> None:
     assert 0.0 < info.dual.kl < 2.0
 
 
+@pytest.mark.parametrize("features", ["rkhs", "grid"])
 @pytest.mark.parametrize("model", ["embedding", "sample"])
-def test_the_weights_are_the_exponentials_of_the_bellman_errors(model: str) -> None:
+def test_the_weights_are_the_exponentials_of_the_bellman_errors(model: str, features: str) -> None:
     """Eqs. 1, 4 and 5 put together from the learnt V and hyper-parameters, in plain NumPy."""
     restart = 0.07
     rollouts = collect(steps=12) + collect(4, 5, seed=1, terminated=True)
-    settings = settings_of(model=model, restart_probability=restart)
+    settings = settings_of(model=model, features=features, restart_probability=restart)
     state, info = run(rollouts, settings)
     value = state.value
     assert value is not None
@@ -189,6 +207,63 @@ def test_the_policy_is_the_weighted_process_of_the_commanded_actions() -> None:
     np.testing.assert_allclose(
         state.policy.standard_deviation(query)[:, 0], 2.0 * np.sqrt(variance), rtol=1e-6
     )
+
+
+def test_fits_start_where_those_of_the_last_update_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    starts: list[FloatArray] = []
+
+    def spy(loss: Any, prior: Prior, start: FloatArray) -> FloatArray:
+        starts.append(start)
+        return minimise(loss, prior, start)
+
+    monkeypatch.setattr(reps, "minimise", spy)
+    first, _ = run(collect(seed=1))
+    second, _ = run(collect(seed=2), state=first)
+    assert len(starts) == 4  # embedding and policy, twice
+    assert first.embedding_start is not None
+    assert first.policy_start is not None
+    np.testing.assert_array_equal(starts[2], first.embedding_start)
+    np.testing.assert_array_equal(starts[3], first.policy_start)
+    assert second.embedding_start is not None
+    assert not np.array_equal(second.embedding_start, first.embedding_start)
+
+
+def test_policy_hyperparameters_are_the_most_probable_ones() -> None:
+    """Leave-one-out loss plus ``1/2 sum ((x - c) / sd)^2 / sum w``, minimised afresh by BFGS."""
+    rng = np.random.default_rng(13)
+    states, targets = rng.normal(size=(25, 2)), rng.normal(0.0, 0.8, size=(25, 1))
+    samples = PolicySamples(states, targets, rng.uniform(0.2, 2.0, 25))
+    kernel = Kernel(factors_of(2), np.array([0.9, 1.4]))
+    found = policy_hyperparameters(samples, kernel, settings_of(), None, rng)
+
+    share = samples.weights / samples.weights.sum()
+    log_variance = np.log(share @ (targets[:, 0] - share @ targets[:, 0]) ** 2)
+    centre = np.append(np.log([0.9, 1.4]) - 0.5, [log_variance - 0.3, log_variance - 1.0])
+    spread = np.array([0.7, 0.7, 1.0, 1.0])
+    loss = PolicyLoss(factor_distances(kernel.factors, states), targets, samples.weights)
+
+    def objective(x: FloatArray) -> float:
+        penalty = 0.5 * np.sum(((x - centre) / spread) ** 2) / samples.weights.sum()
+        return float(loss(x)[0] + penalty)
+
+    best = scipy.optimize.minimize(objective, centre, method="BFGS", options={"gtol": 1e-6})
+    np.testing.assert_allclose(found, best.x, atol=0.05)
+    assert objective(found) == pytest.approx(best.fun, abs=1e-4)
+
+
+def test_bounded_policy_hyperparameters_keep_to_their_ranges() -> None:
+    rng = np.random.default_rng(14)
+    kernel = Kernel(factors_of(2), np.array([0.9, 1.4]))
+    states = rng.normal(size=(40, 2))
+    low = np.log([0.3 * 0.9, 0.3 * 1.4, 0.01, 1e-4])
+    high = np.log([0.9, 1.4, 3.0, 4.0])
+    # Pure noise asks for a long lengthscale, targets all zero for no variance.
+    for targets in (rng.normal(size=(40, 1)), np.zeros((40, 1)), 100.0 * states[:, :1]):
+        samples = PolicySamples(states, targets, np.ones(40))
+        found = policy_hyperparameters(samples, kernel, settings_of("paper"), None, rng)
+        assert (found >= low - 1e-12).all()
+        assert (found <= high + 1e-12).all()
+        assert (np.minimum(found - low, high - found) < 1e-6).any()
 
 
 def test_the_new_policy_pushes_towards_the_reward() -> None:

@@ -44,6 +44,7 @@ def test_an_unknown_parameter_is_refused_with_the_choices() -> None:
     ("name", "value"),
     [
         ("model", "exact"),
+        ("features", "RKHS"),
         ("policy_fit", "mle"),
         ("exploration", None),
         *[
@@ -55,7 +56,13 @@ def test_an_unknown_parameter_is_refused_with_the_choices() -> None:
         *[("restart_probability", value) for value in (0.0, 1.0, -0.1, 1.5, float("nan"), "0.1")],
         *[
             (name, value)
-            for name in ("initial_rollouts", "rollouts_per_iteration", "window", "max_rank")
+            for name in (
+                "initial_rollouts",
+                "rollouts_per_iteration",
+                "window",
+                "max_rank",
+                "grid_size",
+            )
             for value in (0, -3, 2.5, 10.0, "10", True)
         ],
     ],
@@ -74,6 +81,7 @@ def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
         ("restart_probability", 0.999),
         ("window", 1),
         ("model", "sample"),
+        ("features", "grid"),
         ("policy_fit", "bounded"),
         ("exploration", "gaussian"),
     ],

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from kreps.arrays import FloatArray
+from kreps.errors import ConfigurationError
 from kreps.kernels import Kernel, factors_of
-from kreps.value import RBFGrid, RKHSBasis
+from kreps.value import MAX_CENTRES, RBFGrid, RKHSBasis
 
 KERNEL = Kernel(factors_of(2, periodic=(0,)), np.array([1.0, 1.5]))
 
@@ -97,3 +98,43 @@ def test_a_grid_of_radial_basis_functions() -> None:
     np.testing.assert_allclose(grid.features(new), wanted, atol=1e-12)
     theta = np.array([1.0, -2.0, 0.5])
     np.testing.assert_allclose(grid.value_function(theta)(new), wanted @ theta, atol=1e-12)
+
+
+def test_a_grid_over_data_has_its_lengthscale_for_spacing() -> None:
+    points = np.array([[0.3, -2.0], [5.0, 1.0], [-4.0, 4.0]])
+    grid, features = RBFGrid.over(factors_of(2, periodic=(0,)), points, 4)
+    assert features.shape == (3, 16)
+    np.testing.assert_array_equal(features, grid.features(points))
+    # The angle gets a whole turn without its end, the velocity the range of the data.
+    np.testing.assert_allclose(np.unique(grid.centres[:, 0]), np.pi * np.array([0, 0.5, 1, 1.5]))
+    np.testing.assert_allclose(np.unique(grid.centres[:, 1]), [-2.0, 0.0, 2.0, 4.0])
+    assert len(np.unique(grid.centres, axis=0)) == 16
+    # A neighbour in either direction is one lengthscale away, across the turn too.
+    angle = grid.features(np.array([[1.5 * np.pi, 0.0], [2.0 * np.pi, 0.0]]))
+    at = np.flatnonzero((grid.centres[:, 0] == 0.0) & (np.abs(grid.centres[:, 1]) < 1e-12))
+    np.testing.assert_allclose(angle[:, at[0]], [np.exp(-0.5), 1.0])
+    velocity = grid.features(np.array([[0.0, 2.0]]))
+    np.testing.assert_allclose(velocity[:, at[0]], np.exp(-0.5))
+    assert grid.residual == 0.0
+
+
+@pytest.mark.parametrize("periodic", [(), (0,)])
+@pytest.mark.parametrize("size", [1, 2, 5])
+def test_a_grid_of_any_size_covers_the_data(size: int, periodic: tuple[int, ...]) -> None:
+    points = np.random.default_rng(13).uniform(-1.0, 1.0, size=(50, 1))
+    _, features = RBFGrid.over(factors_of(1, periodic), points, size)
+    assert features.shape == (50, size)
+    assert features.max(axis=1).min() > 0.1  # no point is far from all centres
+
+
+def test_a_coordinate_without_range_does_not_spoil_the_grid() -> None:
+    points = np.column_stack([np.full(9, 0.7), np.linspace(0.0, 1.0, 9)])
+    grid, features = RBFGrid.over(factors_of(2), points, 3)
+    assert np.isfinite(features).all()
+    assert features.max(axis=1).min() > 0.5
+    np.testing.assert_allclose(grid.kernel.lengthscales, [1.0, 0.5])
+
+
+def test_a_grid_too_large_to_solve_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match=str(MAX_CENTRES)):
+        RBFGrid.over(factors_of(4), np.random.default_rng(14).normal(size=(5, 4)), 9)

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kreps.arrays import BoolArray, FloatArray, IntArray, as_float
+from kreps.arrays import BoolArray, FloatArray, IntArray
 from kreps.errors import ConfigurationError, DataError
 
 
@@ -28,8 +28,8 @@ class TaskSpec:
     periodic: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "action_low", np.atleast_1d(as_float(self.action_low)))
-        object.__setattr__(self, "action_high", np.atleast_1d(as_float(self.action_high)))
+        object.__setattr__(self, "action_low", np.array(self.action_low, np.float64, ndmin=1))
+        object.__setattr__(self, "action_high", np.array(self.action_high, np.float64, ndmin=1))
         object.__setattr__(self, "periodic", tuple(sorted(int(i) for i in self.periodic)))
         if self.observation_size < 1:
             raise ConfigurationError(

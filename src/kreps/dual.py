@@ -127,9 +127,10 @@ class DualSolution:
         eta: temperature, in units of the standardised rewards.
         theta: (r,) coordinates of V.
         weights: (n,) the p_i of Eq. 1.
-        dual, primal: values of the two problems; weak duality makes ``dual >= primal``, so a
-            small ``gap`` proves both optimal.  At the floor both are those of the problem with
-            the temperature held there.
+        dual, primal: values of the two problems.  For feasible weights ``dual >= primal``, so a
+            small ``gap`` proves both optimal; it is ``eta (epsilon - KL) + |B'p + rho theta|^2 /
+            (2 rho)``, and as negative as KL may exceed its bound (1e-4 of it).  At the floor both
+            are those of the problem with the temperature held there.
         kl: realised ``KL(p || uniform)``, equal to the bound unless eta is at its floor.
         decrement: half the squared Newton decrement.
         stationarity: ``|B'p + rho theta|``, the residual of the stationarity condition.
@@ -184,12 +185,13 @@ def solve_dual(problem: DualProblem, max_iterations: int = 40) -> DualSolution:
         problem: the update's data.
         max_iterations: of the joint Newton method before the fallback takes over.
     """
-    start = max(1.0, problem.eta_floor)
+    # Where all rewards agree nothing can be gained, and the temperature belongs to its floor.
+    start = max(1.0, problem.eta_floor) if problem.rewards.any() else problem.eta_floor
     zero = np.zeros(problem.differences.shape[1])
     end = _newton(problem, start, zero, max_iterations, eta_free=True)
     outcome = Outcome.BOUND_ACTIVE
     if not end.converged:
-        end = _bisection(problem)
+        end = _bisection(problem, end)
         outcome = Outcome.FALLBACK if end.converged else Outcome.NOT_CONVERGED
     if end.converged and end.eta <= problem.eta_floor:
         outcome = Outcome.AT_FLOOR
@@ -264,7 +266,7 @@ def _newton(
     return _Progress(eta, theta, decrement, max_iterations, jitter, False)
 
 
-def _bisection(problem: DualProblem) -> _Progress:
+def _bisection(problem: DualProblem, stalled: _Progress) -> _Progress:
     """Newton in theta along a path of temperatures: slow and sure, as KL falls with eta.
 
     From eta = 1 the temperature is halved (or doubled) until the KL bound is passed, then
@@ -272,8 +274,7 @@ def _bisection(problem: DualProblem) -> _Progress:
     """
     eta, theta = max(1.0, problem.eta_floor), np.zeros(problem.differences.shape[1])
     low, high = 0.0, np.inf  # KL is too large at low, too small at high
-    iterations, jitter = 0, 0.0
-    end = _Progress(eta, theta, np.inf, 0, 0.0, False)
+    iterations, jitter, end = stalled.iterations, stalled.jitter, stalled
     for _ in range(100):
         end = _newton(problem, eta, theta, 100, eta_free=False)
         theta = end.theta

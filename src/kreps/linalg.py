@@ -49,7 +49,7 @@ def cholesky(a: FloatArray) -> Cholesky:
         NumericalError: not positive definite at the largest jitter, or not finite.
     """
     scale = float(np.mean(np.diagonal(a))) if len(a) else 1.0
-    for relative in _JITTERS:
+    for relative in _JITTERS if np.isfinite(scale) else ():
         jitter = relative * scale
         shifted = a + jitter * np.eye(len(a)) if jitter else a
         lower, info = lapack.dpotrf(shifted, lower=1, clean=1)

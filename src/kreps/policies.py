@@ -54,7 +54,9 @@ MAX_SUPPORT = 10_000
 """Most support points of an exact policy: it costs their square in memory, their cube in time."""
 
 PIVOT_TOLERANCE = 1e-12
-"""Largest squared residual of a support point's kernel function outside the span of the pivots'."""
+"""Largest squared residual of a support point's kernel function outside the span of the pivots'.
+
+The scaled mean is off by at most ``sf2 sqrt(1e-12) sum |alpha|``: about 1e-5 on learnt policies."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ class CostSensitiveGP:
 class Predictor:
     """Mean and variance of a cost-sensitive GP from its kernel values at r pivots only.
 
-    The kernel of any state with the m support points is, to `PIVOT_TOLERANCE`, a linear function
+    The kernel of any state with the m support points is, up to `PIVOT_TOLERANCE`, a linear function
     of its kernel with r of them (the pivots of a Cholesky factorisation), and r << m for smooth
     kernels.  So both moments become products with (r, r) matrices computed once: a control
     cycle costs r^2 instead of m^2.

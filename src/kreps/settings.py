@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
+from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
 from kreps.errors import ConfigurationError
@@ -67,9 +69,9 @@ class Settings:
                     + ", ".join(repr(choice) for choice in get_args(kind))
                 )
         for name in ("kl_bound", "ridge", "exploration_scale", "basis_tolerance"):
-            _require(name, getattr(self, name), "positive", lambda v: 0 < v < float("inf"))
-        _require("eta_floor", self.eta_floor, "zero or positive", lambda v: 0 <= v < float("inf"))
-        _require("restart_probability", self.restart_probability, "in (0, 1)", lambda v: 0 < v < 1)
+            self._check(name, Real, "positive and finite", lambda v: 0 < v < float("inf"))
+        self._check("eta_floor", Real, "finite and >= 0", lambda v: 0 <= v < float("inf"))
+        self._check("restart_probability", Real, "in (0, 1)", lambda v: 0 < v < 1)
         for name in (
             "initial_rollouts",
             "rollouts_per_iteration",
@@ -77,14 +79,15 @@ class Settings:
             "max_rank",
             "grid_size",
         ):
-            _require(name, getattr(self, name), "a whole number >= 1", lambda v: v >= 1, int)
+            self._check(name, Integral, "a whole number >= 1", lambda v: v >= 1)
 
-
-def _require(
-    name: str, value: Any, limit: str, holds: Any, kind: type | tuple[type, ...] = (int, float)
-) -> None:
-    if isinstance(value, bool) or not isinstance(value, kind) or not holds(value):
-        raise ConfigurationError(f"{name} = {value!r}, but it must be {limit}")
+    def _check(self, name: str, kind: type, limit: str, holds: Callable[[Any], bool]) -> None:
+        """Take numbers of any make, NumPy's too, and keep them as Python's."""
+        value = getattr(self, name)
+        is_number = isinstance(value, kind) and not isinstance(value, bool)
+        if not (is_number and holds(value)):
+            raise ConfigurationError(f"{name} = {value!r}, but it must be {limit}")
+        object.__setattr__(self, name, int(value) if kind is Integral else float(value))
 
 
 RECIPES: dict[str, Settings] = {

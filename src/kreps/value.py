@@ -119,7 +119,7 @@ class RBFGrid:
         for i, factor in enumerate(factors):
             if isinstance(factor, Periodic):
                 axes.append(np.arange(size) * 2.0 * np.pi / size)
-                lengthscales.append(2.0 * np.sin(np.pi / size))  # the chord of the spacing
+                lengthscales.append(2.0 * np.sin(np.pi / max(size, 2)))  # the chord of the spacing
             else:
                 low, high = points[:, i].min(), points[:, i].max()
                 axes.append(np.linspace(low, high, size))

@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
 from typing import Any
@@ -132,3 +132,20 @@ def write_results(
     }
     write_atomically(folder / f"{name}.json", (json.dumps(content, indent=2) + "\n").encode())
     return summary
+
+
+def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
+    """The summary as the documentation shows it."""
+    lines = [
+        "| method | stochastic policy | worst seed | greedy policy | worst seed | CPU s / update |",
+        "|---|---|---|---|---|---|",
+    ]
+    for method, entry in summary.items():
+        cells = [method]
+        for name in ("stochastic", "greedy"):
+            found = entry[name]
+            cells.append(f"{found['mean']:.2f} ± {found['two_standard_errors']:.2f}")
+            cells.append(f"{found['worst']:.2f}")
+        cells.append(f"{entry['mean_update_cpu_seconds']:.2f}")
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
