@@ -14,9 +14,9 @@ def test_the_default_recipe_is_the_defaults() -> None:
     assert settings_of() == settings_of("default") == Settings()
 
 
-def test_the_paper_recipe_has_no_floor_and_hard_ranges() -> None:
+def test_the_paper_recipe_has_a_low_floor_and_hard_ranges() -> None:
     paper = settings_of("paper")
-    assert (paper.eta_floor, paper.policy_fit) == (0.0, "bounded")
+    assert (paper.eta_floor, paper.policy_fit) == (0.02, "bounded")
     assert 0.0 < paper.kl_bound < 1.0  # the paper leaves it open
     assert paper.model == "embedding"
     assert (paper.initial_rollouts, paper.rollouts_per_iteration, paper.window) == (30, 10, 30)
@@ -26,7 +26,7 @@ def test_the_paper_recipe_has_no_floor_and_hard_ranges() -> None:
 def test_a_change_overrides_the_recipe_and_nothing_else() -> None:
     changed = settings_of("paper", kl_bound=0.25, window=12, model="sample")
     assert (changed.kl_bound, changed.window, changed.model) == (0.25, 12, "sample")
-    assert (changed.eta_floor, changed.policy_fit) == (0.0, "bounded")
+    assert (changed.eta_floor, changed.policy_fit) == (0.02, "bounded")
     assert settings_of("paper").kl_bound != 0.25
 
 

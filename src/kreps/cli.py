@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +15,7 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from kreps.controller import Policy
 from kreps.data import TaskSpec
@@ -26,6 +27,7 @@ from kreps.experiments.specs import EXPERIMENTS
 from kreps.learner import KREPS
 from kreps.rollout import Environment
 from kreps.runs import RunConfig, RunFolder
+from kreps.settings import settings_of
 from kreps.storage import write_atomically
 from kreps.threads import blas_threads
 
@@ -108,10 +110,12 @@ def resume(
         learner = KREPS.resume(folder.checkpoint_file, env)
     else:  # stopped before the first update
         learner = _learner(config, env)
-    target = config.iterations if iterations is None else iterations
+    if iterations is not None:  # kept, so that the next interruption knows the new target too
+        config = replace(config, iterations=iterations)
+        folder.write_config(config)
     done = learner.state.iteration
-    console.print(f"{run}: {done} updates made, {max(target - done, 0)} to go")
-    _learn(folder, learner, target, report)
+    say(f"{run}: {done} updates made, {max(config.iterations - done, 0)} to go")
+    _learn(folder, learner, config.iterations, report)
 
 
 @app.command(
@@ -135,7 +139,7 @@ def plot(run: RunArgument) -> None:
     """Draw the learning curve and, for two-dimensional states, maps of policy and V."""
     folder = RunFolder(run)
     for path in _plot(folder, _learnt(folder)):
-        console.print(f"drew {path}")
+        say(f"drew {path}")
 
 
 @app.command(
@@ -154,7 +158,7 @@ def video(
 ) -> None:
     """Film the learnt policy in its environment."""
     folder = RunFolder(run)
-    console.print(f"filmed {_film(folder, _learnt(folder), steps, stochastic, seed, out)}")
+    say(f"filmed {_film(folder, _learnt(folder), steps, stochastic, seed, out)}")
 
 
 @app.command(
@@ -209,18 +213,18 @@ def reproduce(
         ]
         table.add_row(method, *columns)
     console.print(table)
-    console.print(f"Results:   {out / experiment}.csv, {out / experiment}.json")
-    console.print(f"Figure:    {plotting.save(figure, out / f'{experiment}.png')}")
+    say(f"Results:   {out / experiment}.csv, {out / experiment}.json")
+    say(f"Figure:    {plotting.save(figure, out / f'{experiment}.png')}")
 
 
 def main() -> None:
     """Entry point: errors of the library come out as one line, not as a traceback."""
     try:
-        app(standalone_mode=False)
+        sys.exit(app(standalone_mode=False))  # a command's typer.Exit comes back as its code
     except KrepsError as error:
-        _fail(str(error))
-    except typer.Exit as stop:
-        sys.exit(stop.exit_code)
+        complaint = Text.assemble(("error: ", "bold red"), str(error))
+        Console(stderr=True).print(complaint, soft_wrap=True)
+        sys.exit(2)
     except Exception as error:
         if hasattr(error, "show"):  # a usage error of the command line
             error.show()
@@ -231,9 +235,9 @@ def main() -> None:
 # ---- parts ------------------------------------------------------------------------------------
 
 
-def _fail(message: str) -> None:
-    Console(stderr=True).print(f"[bold red]error:[/bold red] {message}", highlight=False)
-    sys.exit(2)
+def say(message: str) -> None:
+    """Plain words: no markup, as paths may hold brackets; no line breaks, as they may be long."""
+    console.print(message, markup=False, highlight=False, soft_wrap=True)
 
 
 def _setting(text: str) -> tuple[str, Any]:
@@ -258,6 +262,7 @@ def _make(environment: str, **options: Any) -> Environment:
 
 
 def _learner(config: RunConfig, env: Environment) -> KREPS:
+    settings_of(config.recipe, **config.settings)  # complains of anything that is no setting
     return KREPS(
         env,
         seed=config.seed,
@@ -280,22 +285,23 @@ def _learnt(folder: RunFolder) -> KREPS:
 
 def _learn(folder: RunFolder, learner: KREPS, target: int, report: bool) -> None:
     left = target - learner.state.iteration
+    folder.rows()  # complains now, not after the first update, if they are damaged
     try:
         if left > 0:
             learner.learn(left, callback=folder)
     except KeyboardInterrupt:
-        console.print(
+        say(
             f"\nstopped after {learner.state.iteration} of {target} updates; "
             f"go on with: kreps resume {folder.path}"
         )
         raise typer.Exit(130) from None
     except EnvironmentFailure:
-        console.print(f"once it is mended, go on with: kreps resume {folder.path}")
+        say(f"once it is mended, go on with: kreps resume {folder.path}")
         raise
     if report:
         _report(folder, learner)
     else:
-        console.print(f"policy: {folder.policy_file}")
+        say(f"policy: {folder.policy_file}")
 
 
 def _report(folder: RunFolder, learner: KREPS) -> None:
@@ -303,21 +309,21 @@ def _report(folder: RunFolder, learner: KREPS) -> None:
     pictures = _plot(folder, learner)
     try:
         pictures.append(_film(folder, learner, 120, False, 0, None))
-    except ConfigurationError as error:
-        console.print(f"no film: {error}")
+    except (ConfigurationError, EnvironmentFailure) as error:
+        say(f"no film: {error}")
     state = learner.state
     greedy = evaluation["greedy"].mean
-    console.print(
-        f"\n[bold]{state.iteration} updates from {state.rollouts} roll-outs "
-        f"({state.steps} environment steps).[/bold] The learnt policy earns "
-        f"{greedy:.4g} per step without noise and {evaluation['stochastic'].mean:.4g} with it."
+    say(
+        f"\n{state.iteration} updates from {state.rollouts} roll-outs "
+        f"({state.steps} environment steps). The learnt policy earns {greedy:.4g} per step "
+        f"without noise and {evaluation['stochastic'].mean:.4g} with it."
         + _in_words(folder.config().environment, greedy)
     )
-    console.print(f"Policy:    {folder.policy_file}  (kreps.load_policy reads it)")
-    console.print(f"Numbers:   {folder.progress_file}, {folder.evaluation_file}")
+    say(f"Policy:    {folder.policy_file}  (kreps.load_policy reads it)")
+    say(f"Numbers:   {folder.progress_file}, {folder.evaluation_file}")
     for path in pictures:
-        console.print(f"Picture:   {path}")
-    console.print(f"Go on:     kreps resume {folder.path} --iterations {2 * state.iteration}")
+        say(f"Picture:   {path}")
+    say(f"Go on:     kreps resume {folder.path} --iterations {2 * state.iteration}")
 
 
 def _in_words(environment: str, reward: float) -> str:
@@ -384,14 +390,13 @@ def _plot(folder: RunFolder, learner: KREPS) -> list[Path]:
 
     assert learner.env is not None
     environment = folder.config().environment
-    evaluation = None
-    if folder.evaluation_file.exists():
-        evaluation = json.loads(folder.evaluation_file.read_text())
-        if evaluation.get("iteration") != learner.state.iteration:
-            evaluation = None  # of an earlier policy
+    rows = folder.rows()
+    if not rows:
+        raise ConfigurationError(f"{folder.progress_file} holds no iteration to draw")
+    evaluation = folder.evaluation(learner.state.iteration)
     with console.status("drawing ..."):
         curve = plotting.learning_curve(
-            folder.rows(), REFERENCE_REWARDS.get(environment, {}), evaluation, environment
+            rows, REFERENCE_REWARDS.get(environment, {}), evaluation, environment
         )
         drawn = [plotting.save(curve, folder.path / "learning_curve.png")]
         if learner.task.observation_size == 2:
@@ -409,20 +414,25 @@ def _film(
 
     env = _make(folder.config().environment, render_mode="rgb_array")
     policy = Policy(learner.policy.process, seed)
-    observation, _ = env.reset(seed=seed)
     frames, observations, actions = [], [], []
     with console.status("filming ..."):
-        for _ in range(steps):
-            action, _ = policy.predict(observation.ravel(), deterministic=not stochastic)
-            frames.append(env.render())
-            observations.append(observation.ravel())
-            actions.append(action)
-            space = env.action_space
-            observation, _, terminated, truncated, _ = env.step(
-                action.astype(space.dtype).reshape(space.shape or ())
-            )
-            if terminated or truncated:
-                break
+        try:
+            observation, _ = env.reset(seed=seed)
+            for _ in range(steps):
+                action, _ = policy.predict(observation.ravel(), deterministic=not stochastic)
+                frames.append(env.render())
+                observations.append(observation.ravel())
+                actions.append(action)
+                space = env.action_space
+                observation, _, terminated, truncated, _ = env.step(
+                    action.astype(space.dtype).reshape(space.shape or ())
+                )
+                if terminated or truncated:
+                    break
+        except Exception as error:  # whatever a foreign environment raises
+            raise EnvironmentFailure(
+                f"the environment cannot be filmed, it raised {type(error).__name__}: {error}"
+            ) from error
         return plotting.film(
             frames,
             observations=np.array(observations),

@@ -9,6 +9,7 @@ import numpy as np
 
 from kreps import storage
 from kreps.arrays import FloatArray
+from kreps.data import LARGEST, is_sane
 from kreps.errors import DataError
 from kreps.policies import CostSensitiveGP
 from kreps.seeding import Purpose, generator
@@ -56,8 +57,11 @@ class Policy:
                 f"the observation has shape {batch.shape}, but ({task.observation_size},) or "
                 f"(m, {task.observation_size}) is needed; flatten images first"
             )
-        if not np.isfinite(batch).all():
-            raise DataError("the observation holds NaN or an infinity: no action is safe there")
+        if not is_sane(batch).all():
+            raise DataError(
+                f"the observation holds NaN, an infinity or a number beyond {LARGEST:g}: "
+                "no action is safe there"
+            )
         states = np.atleast_2d(batch)
         if deterministic:
             commanded = self.process.mean(states)

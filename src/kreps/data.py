@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,6 +11,14 @@ import numpy as np
 
 from kreps.arrays import BoolArray, FloatArray, IntArray
 from kreps.errors import ConfigurationError, DataError
+
+LARGEST = 1e100
+"""Numbers beyond this are no data: their squares would overflow."""
+
+
+def is_sane(values: FloatArray) -> BoolArray:
+    """Which ``values`` are neither NaN nor infinite nor absurdly large."""
+    return np.abs(values) <= LARGEST
 
 
 @dataclass(frozen=True)
@@ -30,7 +39,14 @@ class TaskSpec:
     def __post_init__(self) -> None:
         object.__setattr__(self, "action_low", np.array(self.action_low, np.float64, ndmin=1))
         object.__setattr__(self, "action_high", np.array(self.action_high, np.float64, ndmin=1))
-        object.__setattr__(self, "periodic", tuple(sorted(int(i) for i in self.periodic)))
+        try:
+            object.__setattr__(
+                self, "periodic", tuple(sorted(operator.index(i) for i in self.periodic))
+            )
+        except TypeError as error:
+            raise ConfigurationError(
+                f"periodic = {self.periodic!r}, but it must list numbers of coordinates, as (0, 2)"
+            ) from error
         if self.observation_size < 1:
             raise ConfigurationError(
                 f"observation_size = {self.observation_size}, but at least one coordinate is needed"
@@ -102,11 +118,11 @@ class Rollout:
                     f"{name} have shape {values.shape}, but {dimensions} dimensions are needed: "
                     "observations (T + 1, ds), actions (T, da), rewards (T,)"
                 )
-            if not np.isfinite(values).all():
-                row = int(np.argwhere(~np.isfinite(values))[0, 0])
+            if not is_sane(values).all():
+                row = int(np.argwhere(~is_sane(values))[0, 0])
                 raise DataError(
-                    f"{name} hold NaN or an infinity, first in row {row}; "
-                    "drop the roll-out, or cut it before that step"
+                    f"{name} hold NaN, an infinity or a number beyond {LARGEST:g}, first in row "
+                    f"{row}; drop the roll-out, or cut it before that step"
                 )
             values.flags.writeable = False
             object.__setattr__(self, name, values)

@@ -89,8 +89,9 @@ class Kernel:
 
 def gaussian_gram(e: FloatArray, f: FloatArray | None = None) -> FloatArray:
     """``exp(-|e_i - f_j|^2 / 2)`` for coordinates (n, m) and (k, m); ``f`` None means ``e``."""
-    # Distances do not feel a common shift, but rounding does: centre first.
-    centre = (e if f is None else f).mean(axis=0)
+    # Distances do not feel a common shift, but rounding does: centre first.  On e alone, so that
+    # what comes out for one f_j does not depend on the others.
+    centre = e.mean(axis=0)
     e = e - centre
     f_centred = e if f is None else f - centre
     k = e @ f_centred.T  # NumPy uses the symmetric product when both are one array

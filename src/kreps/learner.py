@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from numbers import Integral
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,12 @@ from kreps.seeding import Purpose, generator
 from kreps.settings import Settings, settings_of
 from kreps.threads import blas_threads
 from kreps.value import ValueFunction
+
+
+def _whole(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 0:
+        raise ConfigurationError(f"{name} = {value!r}, but it must be a whole number >= 0")
+    return int(value)
 
 
 @dataclass(frozen=True)
@@ -77,8 +84,7 @@ class KREPS:
         threads: int | None = 1,
         **settings: Any,
     ) -> None:
-        if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-            raise ConfigurationError(f"seed = {seed!r}, but it must be a whole number >= 0")
+        self.seed = _whole("seed", seed)
         self.env: Environment | None = None
         if isinstance(env, TaskSpec):
             self.task = env
@@ -88,9 +94,9 @@ class KREPS:
             if restart_probability is not None:
                 settings.setdefault("restart_probability", restart_probability)
         self.settings: Settings = settings_of(recipe, **settings)
-        self.seed = seed
         self.threads = threads
         self.state = LearnerState(Window(self.settings.window))
+        self._policy: Policy | None = None
 
     @property
     def policy(self) -> Policy:
@@ -103,7 +109,9 @@ class KREPS:
             raise ConfigurationError(
                 "no policy has been learnt yet; call learn() or update() first"
             )
-        return Policy(self.state.policy, self.seed)
+        if self._policy is None or self._policy.process is not self.state.policy:
+            self._policy = Policy(self.state.policy, self.seed)
+        return self._policy
 
     @property
     def value_function(self) -> ValueFunction:
@@ -140,12 +148,13 @@ class KREPS:
                 "this learner was made from a TaskSpec and has no environment to roll out in; "
                 "give it data by update(rollouts), or make it from an environment"
             )
+        iterations = _whole("iterations", iterations)
         callbacks = [callback] if callable(callback) else list(callback)
         if progress:
             from kreps.progress import ProgressTable
 
             with ProgressTable(self.settings, self.state.iteration + iterations) as table:
-                return self._learn(iterations, [table, *callbacks], table.rollouts_done)
+                return self._learn(iterations, [*callbacks, table], table.rollouts_done)
         return self._learn(iterations, callbacks, None)
 
     def _learn(
@@ -195,6 +204,8 @@ class KREPS:
         Raises:
             DataError: not roll-outs, none of them, or of other widths than the task's.
         """
+        if isinstance(rollouts, Rollout):
+            raise DataError("update() takes a list of roll-outs; write update([rollout])")
         rollouts = list(rollouts)
         for number, rollout in enumerate(rollouts):
             if not isinstance(rollout, Rollout):

@@ -76,6 +76,12 @@ def solve_lower_transposed(lower: FloatArray, b: FloatArray) -> FloatArray:
     return blas.dtrsm(1.0, lower, b, lower=1, trans_a=1)
 
 
+def inverse_lower(lower: FloatArray) -> FloatArray:
+    """``L^-1`` of a lower triangular (n, n) matrix."""
+    inverse, _ = lapack.dtrtri(lower, lower=1)
+    return inverse
+
+
 @dataclass(frozen=True)
 class PivotedCholesky:
     """``columns @ columns.T`` approximates the matrix; exact on the rows named by ``pivots``.

@@ -16,7 +16,7 @@ from PIL import Image
 from kreps.algorithms.reps import LearnerState
 from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
-from kreps.errors import ConfigurationError
+from kreps.errors import ConfigurationError, StorageError
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -35,8 +35,11 @@ MAP_POINTS = 121
 
 def save(figure: Figure, path: Path) -> Path:
     FigureCanvasAgg(figure)
-    with rc_context(STYLE):
-        figure.savefig(path)
+    try:
+        with rc_context(STYLE):
+            figure.savefig(path)
+    except OSError as error:
+        raise StorageError(f"cannot write the picture {path}: {error}; check the folder") from error
     return path
 
 
@@ -203,7 +206,12 @@ def film(
     # one palette without dithering: neighbouring pictures then differ only where things move
     palette = images[len(images) // 2].quantize(96, dither=Image.Dither.NONE)
     still = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    still[0].save(path, save_all=True, append_images=still[1:], duration=round(1000 / fps), loop=0)
+    try:
+        still[0].save(
+            path, save_all=True, append_images=still[1:], duration=round(1000 / fps), loop=0
+        )
+    except OSError as error:
+        raise StorageError(f"cannot write the film {path}: {error}; check the folder") from error
     return path
 
 
@@ -216,6 +224,8 @@ def _grid(state: LearnerState, task: TaskSpec) -> tuple[FloatArray, FloatArray, 
     axes = []
     for i in range(2):
         low, high = points[:, i].min(), points[:, i].max()
+        if low == high:
+            low, high = low - 1.0, high + 1.0
         if i in task.periodic:  # a whole turn, cut where the task cuts it
             middle = 0.5 * (low + high)
             low, high = middle - np.pi, middle + np.pi

@@ -15,6 +15,7 @@ from kreps.kernels import Kernel, gaussian_gram
 from kreps.linalg import (
     Cholesky,
     cholesky,
+    inverse_lower,
     pivoted_cholesky,
     solve_lower,
     solve_lower_transposed,
@@ -50,7 +51,7 @@ class Gaussian:
         return self.task.action_centre + self.spread * self.task.action_scale * noise
 
 
-MAX_SUPPORT = 10_000
+MAX_SUPPORT = 6_000
 """Most support points of an exact policy: it costs their square in memory, their cube in time."""
 
 PIVOT_TOLERANCE = 1e-12
@@ -162,8 +163,17 @@ class Predictor:
             np.ones(len(states)),
             lambda rows: kernel.gram(states, states[rows]),
             tolerance=PIVOT_TOLERANCE,
-            max_rank=len(states),
+            max_rank=len(states) // 2,
         )
+        if chosen.residual > PIVOT_TOLERANCE:  # not so smooth: all support points are pivots
+            return cls(
+                kernel,
+                kernel.embed(states),
+                policy.signal * policy.alpha,
+                policy.signal * inverse_lower(policy.factor.lower),
+                policy.signal,
+                policy.noise,
+            )
         # k(states, s) = columns phi(s) with phi(s) = lower^-1 k(pivots, s)
         lower = np.tril(chosen.columns[chosen.pivots])
         columns = policy.signal * chosen.columns

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec
+from kreps.data import LARGEST, Rollout, TaskSpec, is_sane
 from kreps.envs.batch import BatchModel
 from kreps.envs.restart import RandomRestart, restart_length
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
@@ -33,6 +33,11 @@ def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec
     Raises:
         SpaceError: a space that cannot be served, with what to do about it.
     """
+    if not isinstance(env, gym.Env):
+        raise ConfigurationError(
+            f"{env!r} is a {type(env).__name__}, but a single gymnasium.Env is needed; make one "
+            "with gymnasium.make(name)"
+        )
     observations, actions = env.observation_space, env.action_space
     if not isinstance(observations, gym.spaces.Box):
         raise SpaceError(
@@ -144,18 +149,30 @@ def _simulate_batch(
     observations = np.empty((longest + 1, len(ends), task.observation_size))
     actions = np.empty((longest, len(ends), task.action_size))
     rewards = np.empty((longest, len(ends)))
-    observations[0] = model.initial(rngs)
-    for t in range(longest):
-        live = np.flatnonzero(ends > t)
-        if len(live) == 0:
-            break
-        noise = np.array([noises[int(j)].standard_normal(task.action_size) for j in live])
-        actions[t, live] = policy.act(observations[t, live], noise)
-        observations[t + 1, live], rewards[t, live], done = model.step(
-            observations[t, live], task.clip(actions[t, live]), [rngs[int(j)] for j in live]
-        )
-        ends[live[done]] = t + 1
-        terminated[live[done]] = True
+    t = 0
+    try:
+        observations[0] = model.initial(rngs)
+        for t in range(longest):
+            live = np.flatnonzero(ends > t)
+            if len(live) == 0:
+                break
+            noise = np.array([noises[int(j)].standard_normal(task.action_size) for j in live])
+            actions[t, live] = policy.act(observations[t, live], noise)
+            successors, rewards[t, live], done = model.step(
+                observations[t, live], task.clip(actions[t, live]), [rngs[int(j)] for j in live]
+            )
+            if np.shape(successors) != (len(live), task.observation_size):
+                raise DataError(
+                    f"the batch model returned observations of shape {np.shape(successors)}, but "
+                    f"({len(live)}, {task.observation_size}) is needed"
+                )
+            observations[t + 1, live] = successors
+            ends[live[done]] = t + 1
+            terminated[live[done]] = True
+    except DataError:
+        raise
+    except Exception as error:
+        raise _failure(error, "its batch of roll-outs", t) from error
     return [
         Rollout(observations[: end + 1, j], actions[:end, j], rewards[:end, j], bool(terminated[j]))
         for j, end in enumerate(ends.tolist())
@@ -178,30 +195,41 @@ def _simulate_one(
     terminated = truncated = False
     try:
         observation, _ = env.reset(seed=seed)
-        observations.append(_flat(observation))
+        observations.append(_state(observation, task))
         while not (terminated or truncated) and len(rewards) < length:
             state = observations[-1]
-            if state.shape != (task.observation_size,) or not np.isfinite(state).all():
-                break  # the roll-out's own check will say what is wrong
             action = policy.act(state[None], noise.standard_normal((1, task.action_size)))[0]
             applied = task.clip(action).astype(space.dtype).reshape(space.shape or ())
             observation, reward, terminated, truncated, _ = env.step(applied)
-            observations.append(_flat(observation))
+            observations.append(_state(observation, task))
             actions.append(action)
             rewards.append(float(reward))
+    except DataError as error:
+        where = f"roll-out {number} of the environment, after {len(actions)} steps"
+        raise DataError(f"{where}: {error}") from error
     except Exception as error:
-        raise EnvironmentFailure(
-            f"the environment raised {type(error).__name__} in roll-out {number}, after "
-            f"{len(rewards)} steps: {error}; what was learnt before is kept, so mend the "
-            "environment and call learn() again"
-        ) from error
+        raise _failure(error, f"roll-out {number}", len(rewards)) from error
     try:
-        rollout = Rollout(np.stack(observations), np.stack(actions), np.array(rewards), terminated)
-        rollout.check(task)
-    except (ValueError, DataError) as error:
+        return Rollout(np.stack(observations), np.stack(actions), np.array(rewards), terminated)
+    except DataError as error:
         raise DataError(f"roll-out {number} of the environment: {error}") from error
-    return rollout
 
 
-def _flat(observation: Any) -> FloatArray:
-    return np.array(observation, dtype=np.float64).ravel()
+def _failure(error: Exception, where: str, steps: int) -> EnvironmentFailure:
+    return EnvironmentFailure(
+        f"the environment raised {type(error).__name__} in {where}, after {steps} steps: {error}; "
+        "what was learnt before is kept, so mend the environment and call learn() again"
+    )
+
+
+def _state(observation: Any, task: TaskSpec) -> FloatArray:
+    """An observation as a vector the policy can be asked about."""
+    state = np.array(observation, dtype=np.float64).ravel()
+    if len(state) != task.observation_size:
+        raise DataError(
+            f"an observation has {len(state)} coordinates, but the space promises "
+            f"{task.observation_size}"
+        )
+    if not is_sane(state).all():
+        raise DataError(f"an observation holds NaN, an infinity or a number beyond {LARGEST:g}")
+    return state

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import platform
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -97,6 +98,10 @@ class RunFolder:
         self.policy_file = self.path / "policy.safetensors"
         self.evaluation_file = self.path / "evaluation.json"
 
+    def write_config(self, config: RunConfig) -> None:
+        content = {**vars(config), "versions": versions()}
+        write_atomically(self.config_file, (json.dumps(content, indent=2) + "\n").encode())
+
     def create(self, config: RunConfig) -> None:
         """Start a run here.
 
@@ -112,8 +117,7 @@ class RunFolder:
             self.path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise StorageError(f"cannot make the folder {self.path}: {error}") from error
-        content = {**vars(config), "versions": versions()}
-        write_atomically(self.config_file, (json.dumps(content, indent=2) + "\n").encode())
+        self.write_config(config)
 
     def config(self) -> RunConfig:
         """Raises `StorageError` if this is not a run folder."""
@@ -125,6 +129,8 @@ class RunFolder:
             for name, kind in types.items():
                 if not isinstance(getattr(config, name), kind):
                     raise TypeError(f"{name} is not a {kind.__name__}")
+            if not isinstance(config.periodic, list | None):
+                raise TypeError("periodic is not a list")
         except (OSError, ValueError, TypeError, AttributeError, RecursionError) as error:
             raise StorageError(
                 f"{self.path} is not a run folder with an intact config.json ({error}); "
@@ -133,14 +139,49 @@ class RunFolder:
         return config
 
     def rows(self) -> list[dict[str, str]]:
-        """What ``progress.csv`` holds, a dictionary a row; empty if there is none."""
+        """What ``progress.csv`` holds, a dictionary a row; empty if there is no such file.
+
+        Raises:
+            StorageError: it is not what a run writes.
+        """
         try:
             with open(self.progress_file, newline="") as file:
-                return [row for row in csv.DictReader(file) if None not in row.values()]
+                reader = csv.DictReader(file)
+                rows = list(reader)
+                if tuple(reader.fieldnames or ()) != COLUMNS:
+                    raise ValueError("its columns are not those of a run")
+                for row in rows:
+                    if not all(
+                        math.isfinite(float(row[name])) for name in COLUMNS if name != "outcome"
+                    ):
+                        raise ValueError("it holds NaN or infinities")
         except FileNotFoundError:
             return []
-        except (OSError, ValueError, csv.Error) as error:
-            raise StorageError(f"cannot read {self.progress_file}: {error}") from error
+        except (OSError, ValueError, TypeError, csv.Error) as error:
+            raise StorageError(
+                f"{self.progress_file} is damaged ({error}); remove it to go on without the rows "
+                "of the past, the checkpoint has all that the learner needs"
+            ) from error
+        return rows
+
+    def evaluation(self, iteration: int) -> dict[str, Any] | None:
+        """What ``evaluation.json`` holds, None if there is none of the policy of ``iteration``.
+
+        Raises:
+            StorageError: it is not what an evaluation writes.
+        """
+        try:
+            content = json.loads(self.evaluation_file.read_text())
+            for name in ("stochastic", "greedy"):
+                if not math.isfinite(content[name]["mean"]):
+                    raise ValueError("it holds NaN or infinities")
+            return content if content["iteration"] == iteration else None
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+            raise StorageError(
+                f"{self.evaluation_file} is damaged ({error}); remove it, or evaluate again"
+            ) from error
 
     def __call__(self, learner: KREPS, report: IterationReport) -> None:
         """As a callback of `KREPS.learn`: keep what was learnt."""

@@ -98,13 +98,13 @@ RECIPES: dict[str, Settings] = {
 (``eta_floor=0`` takes it away); docs/deviations.md says what ``"default"`` changes."""
 
 
-def settings_of(recipe: str = "default", **changes: Any) -> Settings:
+def settings_of(recipe: str = "default", /, **changes: Any) -> Settings:
     """The named recipe with some parameters changed.
 
     Raises:
         ConfigurationError: unknown recipe or parameter, or a value out of range.
     """
-    if recipe not in RECIPES:
+    if not isinstance(recipe, str) or recipe not in RECIPES:
         raise ConfigurationError(
             f"recipe {recipe!r} is unknown; choose one of {', '.join(map(repr, RECIPES))}"
         )

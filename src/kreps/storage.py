@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ import safetensors.numpy
 
 from kreps.algorithms.reps import LearnerState
 from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Window
+from kreps.data import Rollout, TaskSpec, Window, is_sane
 from kreps.errors import KrepsError, StorageError
 from kreps.kernels import Kernel, factors_of
 from kreps.policies import CostSensitiveGP
@@ -28,8 +29,29 @@ from kreps.threads import blas_threads
 from kreps.value import ValueFunction
 
 VERSION = 1
-MAX_FILE_BYTES = 2**31
+MAX_FILE_BYTES = 2**30
 MAX_HEADER_BYTES = 2**18
+
+POLICY_ARRAYS = {
+    "policy.lengthscales",
+    "policy.states",
+    "policy.targets",
+    "policy.weights",
+    "policy.signal_and_noise",
+}
+CHECKPOINT_ARRAYS = POLICY_ARRAYS | {
+    "value.lengthscales",
+    "value.centres",
+    "value.alpha",
+    "window.lengths",
+    "window.terminated",
+    "window.observations",
+    "window.actions",
+    "window.rewards",
+    "start.policy",
+    "start.embedding",
+}
+ARRAYS = {"policy": POLICY_ARRAYS, "checkpoint": CHECKPOINT_ARRAYS}
 
 Tensors = dict[str, FloatArray]
 Header = dict[str, Any]
@@ -40,6 +62,8 @@ Header = dict[str, Any]
 
 def write_atomically(path: Path, content: bytes) -> None:
     """Replace the file as a whole; the directory must exist."""
+    if not path.name or "\0" in str(path):
+        raise StorageError(f"{str(path)!r} does not name a file")
     beside = path.with_name(f".{path.name}.part")
     try:
         with open(beside, "wb") as file:
@@ -48,6 +72,8 @@ def write_atomically(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         beside.replace(path)
     except OSError as error:
+        with suppress(OSError):
+            beside.unlink()
         raise StorageError(
             f"cannot write {path}: {error}; check the folder and its space"
         ) from error
@@ -74,20 +100,31 @@ def read_arrays(path: Path, kind: str) -> tuple[Tensors, Header]:
         with safetensors.safe_open(path, framework="numpy") as file:
             header = _header(file.metadata(), kind)
             names = list(file.keys())
-            foreign = [n for n in names if file.get_slice(n).get_dtype() != "F64"]
-            if foreign:
-                raise StorageError(f"array {foreign[0]!r} is not of 64-bit floats")
+            for name in names:
+                if name not in ARRAYS[kind]:
+                    raise StorageError(f"a {kind} has no array {name!r:.60}")
+                if file.get_slice(name).get_dtype() != "F64":
+                    raise StorageError(f"array {name!r} is not of 64-bit floats")
             tensors = {n: np.asarray(file.get_tensor(n)) for n in names}
     except StorageError as error:
         raise StorageError(f"cannot read {path} as a kreps {kind}: {error}") from error
-    except (OSError, ValueError, TypeError, safetensors.SafetensorError, RecursionError) as error:
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        MemoryError,
+        RecursionError,
+        safetensors.SafetensorError,
+    ) as error:
         raise StorageError(
             f"cannot read {path} as a kreps {kind}: {error}; "
             "the file is damaged or comes from another program"
         ) from error
     for name, values in tensors.items():
-        if not np.isfinite(values).all():
-            raise StorageError(f"{path} holds NaN or infinities in {name!r}: it is damaged")
+        if not is_sane(values).all():
+            raise StorageError(
+                f"{path} holds NaN, infinities or absurdly large numbers in {name!r}: it is damaged"
+            )
     return tensors, header
 
 
@@ -157,8 +194,8 @@ def _task_of(header: Header) -> TaskSpec:
 
 
 def _state_kernel(task: TaskSpec, lengthscales: FloatArray) -> Kernel:
-    if not (lengthscales > 0).all():
-        raise StorageError(f"lengthscales {lengthscales} are not all positive")
+    if not ((lengthscales > 1e-50) & (lengthscales < 1e50)).all():
+        raise StorageError(f"lengthscales {lengthscales} are not all between 1e-50 and 1e50")
     return Kernel(factors_of(task.observation_size, task.periodic), lengthscales)
 
 

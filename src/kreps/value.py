@@ -49,7 +49,7 @@ class ValueFunction:
 
     def __call__(self, states: FloatArray) -> FloatArray:
         """V (m,) at states (m, ds)."""
-        return self.kernel.gram(states, self.centres) @ self.alpha
+        return self.kernel.gram(self.centres, states).T @ self.alpha
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ class RBFGrid:
 
     def features(self, states: FloatArray) -> FloatArray:
         """``phi``, (m, r), at states (m, ds)."""
-        return self.kernel.gram(states, self.centres)
+        return self.kernel.gram(self.centres, states).T
 
     def value_function(self, theta: FloatArray) -> ValueFunction:
         return ValueFunction(self.kernel, self.centres, theta)

@@ -30,7 +30,7 @@ class RandomRestart(gym.Wrapper[Any, Any, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any], probability: float = 0.02) -> None:
         super().__init__(env)
-        if not 0.0 < probability < 1.0:
+        if isinstance(probability, str) or not 0.0 < probability < 1.0:
             raise ConfigurationError(
                 f"restart probability = {probability!r}, but it must lie in (0, 1)"
             )

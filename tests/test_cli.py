@@ -1,0 +1,579 @@
+"""The command line: what it leaves, what it says, and that it never answers with a traceback."""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from PIL import Image
+
+import kreps
+from kreps import cli
+from kreps.evaluation import Greedy, evaluate
+
+NAME = "kreps/SwingUp-v0"
+TINY = [
+    part
+    for setting in ("initial_rollouts=6", "rollouts_per_iteration=3", "window=6")
+    for part in ("--set", setting)
+]
+RUN_FILES = {"config.json", "progress.csv", "checkpoint.safetensors", "policy.safetensors"}
+
+
+class Short(gym.Env[Any, Any]):
+    """Three observations, short episodes, and a picture that cannot be drawn."""
+
+    fails = False
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
+        self.render_mode = render_mode
+        self.observation_space = gym.spaces.Box(-10.0, 10.0, (3,), np.float64)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+        super().reset(seed=seed)
+        return self.np_random.normal(size=3), {}
+
+    def step(self, action: Any) -> Any:
+        if Short.fails:
+            raise RuntimeError("the cable came off")
+        return self.np_random.normal(size=3), -float(action[0] ** 2), False, False, {}
+
+    def render(self) -> Any:
+        raise gym.error.DependencyNotInstalled("pygame is not installed")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _short() -> Iterator[None]:
+    gym.register("kreps-tests/Short-v0", entry_point=Short, max_episode_steps=6)
+    yield
+    del gym.registry["kreps-tests/Short-v0"]
+
+
+def call(*arguments: str | Path) -> tuple[int, str]:
+    """Exit code and all that was printed, with white space made single; tracebacks propagate."""
+    printed = io.StringIO()
+    code: Any = 0
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(printed),
+        contextlib.redirect_stderr(printed),
+    ):
+        patch.setattr(sys, "argv", ["kreps", *map(str, arguments)])
+        patch.setenv("COLUMNS", "400")
+        try:
+            cli.main()
+        except SystemExit as stop:
+            code = stop.code
+    text = " ".join(printed.getvalue().split())
+    assert "Traceback" not in text
+    return code or 0, text
+
+
+def refused(*arguments: str | Path) -> str:
+    """What is said by a command that ends with exit code 2."""
+    code, text = call(*arguments)
+    assert code == 2, text
+    assert "error" in text.lower()
+    return text
+
+
+def train(run: Path, *more: str, environment: str = NAME, iterations: int = 2) -> tuple[int, str]:
+    options = ["--iterations", str(iterations), "--out", run, "--no-report", *TINY, *more]
+    return call("train", environment, *options)
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    run = tmp_path_factory.mktemp("trained") / "run"
+    assert train(run)[0] == 0
+    return run
+
+
+@pytest.fixture
+def run(trained: Path, tmp_path: Path) -> Path:
+    """A run of two iterations that a test may spoil."""
+    return Path(shutil.copytree(trained, tmp_path / "run"))
+
+
+def iteration(run: Path) -> int:
+    return kreps.KREPS.resume(run / "checkpoint.safetensors").state.iteration
+
+
+# ---- help -------------------------------------------------------------------------------------
+
+COMMANDS = [c.name or c.callback.__name__ for c in cli.app.registered_commands if c.callback]
+
+
+def test_all_commands_are_there() -> None:
+    assert {"train", "resume", "evaluate", "plot", "video"} <= set(COMMANDS)
+    code, text = call("--help")
+    assert code == 0
+    assert all(name in text for name in COMMANDS)
+    assert "kreps train kreps/SwingUp-v0" in text
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_help_of_every_command_shows_an_example(command: str) -> None:
+    code, text = call(command, "--help")
+    assert code == 0
+    assert "Example" in text
+    assert f"kreps {command} " in text.split("Example")[1]
+
+
+def test_calling_it_without_anything_shows_the_help() -> None:
+    assert "kreps train" in call()[1]
+
+
+def test_the_examples_of_train_are_valid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = call("train", "--help")[1]
+    examples = [e.split() for e in text.split("Examples:")[1].split(" kreps ")[1:]]
+    mine = [e[1:] for e in examples if e[0] == "train" and "my_robot" not in e[1]]
+    assert len(mine) >= 3
+    monkeypatch.chdir(tmp_path)
+    for number, example in enumerate(mine):
+        place = example.index("--out")
+        example = example[: place + 2]  # the frame of the help may follow
+        example[place + 1] = f"run-{number}"
+        changed = [*example, "--iterations", "1", "--no-report", *TINY]
+        assert call("train", *changed)[0] == 0
+
+
+# ---- train ------------------------------------------------------------------------------------
+
+
+def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path) -> None:
+    assert {p.name for p in trained.iterdir()} == RUN_FILES
+    config = json.loads((trained / "config.json").read_text())
+    assert config["environment"] == NAME
+    assert config["iterations"] == 2 and config["seed"] == 0 and config["recipe"] == "default"
+    assert config["settings"] == {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
+    assert config["versions"]["numpy"] == np.__version__
+    with (trained / "progress.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["iteration"] for row in rows] == ["1", "2"]
+    assert [row["rollouts"] for row in rows] == ["6", "9"]
+    learner = kreps.KREPS.resume(trained / "checkpoint.safetensors")
+    assert int(rows[-1]["steps"]) == learner.state.steps
+    for row in rows:
+        assert 0 < float(row["kl"]) <= float(row["kl_bound"]) * 1.001
+        assert 1 <= float(row["effective_samples"]) <= int(row["samples"])
+        stages = [name for name in row if name.startswith("cpu_seconds_")]
+        assert len(stages) >= 5 and sum(float(row[name]) for name in stages) > 0
+
+
+def test_the_command_line_learns_what_the_library_learns(trained: Path, tmp_path: Path) -> None:
+    learner = kreps.KREPS(
+        gym.make(NAME), seed=0, initial_rollouts=6, rollouts_per_iteration=3, window=6
+    )
+    learner.learn(2, progress=False).policy.save(tmp_path / "policy")
+    assert (tmp_path / "policy").read_bytes() == (trained / "policy.safetensors").read_bytes()
+
+
+def test_seed_recipe_and_periodic_reach_the_learner(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    options = ["--seed", "5", "--recipe", "paper", "--periodic", "0", "--periodic", "2"]
+    options += ["--set", "model=sample", "--set", "kl_bound=0.25"]
+    assert train(run, *options, environment="kreps-tests/Short-v0")[0] == 0
+    learner = kreps.KREPS.resume(run / "checkpoint.safetensors")
+    assert learner.seed == 5 and learner.task.periodic == (0, 2)
+    settings = learner.settings
+    assert settings.model == "sample" and settings.kl_bound == 0.25 and settings.window == 6
+    assert settings.policy_fit == kreps.RECIPES["paper"].policy_fit
+    code, text = call("resume", run, "--iterations", "3", "--no-report")
+    assert code == 0, text
+    assert kreps.KREPS.resume(run / "checkpoint.safetensors").task.periodic == (0, 2)
+
+
+def test_a_whole_training_leaves_all_promised_files_and_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, text = call("train", NAME, "--iterations", "2", "--out", "run", *TINY)
+    assert code == 0
+    pictures = {"learning_curve.png", "policy_maps.png", "video.gif"}
+    assert {p.name for p in Path("run").iterdir()} == RUN_FILES | pictures | {"evaluation.json"}
+    for name in pictures:
+        with Image.open(Path("run") / name) as picture:
+            picture.load()
+            assert min(picture.size) > 200
+            assert len(np.unique(np.asarray(picture.convert("L")))) > 10  # something is drawn
+    evaluation = json.loads(Path("run/evaluation.json").read_text())
+    greedy = evaluation["greedy"]["mean"]
+    assert evaluation["iteration"] == 2 and -150 < greedy < -20
+    assert "2 updates from 9 roll-outs" in text
+    assert f"{greedy:.4g} per step" in text and "of the way from" in text
+    for name in ("run/policy.safetensors", "run/progress.csv", *(f"run/{p}" for p in pictures)):
+        assert name in text
+    assert "kreps resume run" in text
+
+
+def test_a_run_is_not_overwritten(run: Path) -> None:
+    before = {p.name: p.read_bytes() for p in run.iterdir()}
+    text = refused("train", NAME, "--out", run, *TINY)
+    assert "holds a run already" in text
+    assert "kreps resume" in text and "another folder" in text
+    assert {p.name: p.read_bytes() for p in run.iterdir()} == before
+
+
+def test_an_empty_folder_may_be_used(tmp_path: Path) -> None:
+    assert train(tmp_path, iterations=1)[0] == 0
+    assert {p.name for p in tmp_path.iterdir()} == RUN_FILES
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["nowhere/Nothing-v0"], "nowhere/Nothing-v0"),
+        (["no_such_module:Nothing-v0"], "no_such_module"),
+        (["SwingUp"], "SwingUp"),
+        ([""], "environment"),
+        (["CartPole-v1"], "Discrete(2)"),
+        ([NAME, "--recipe", "cake"], "'default', 'paper'"),
+        ([NAME, "--set", "kl_bound"], "NAME=VALUE"),
+        ([NAME, "--set", "kl_bound=wide"], "kl_bound = 'wide'"),
+        ([NAME, "--set", "kl_bound=-1"], "kl_bound = -1"),
+        ([NAME, "--set", "kl_bound=NaN"], "kl_bound = nan"),
+        ([NAME, "--set", "kl_bound="], "kl_bound"),
+        ([NAME, "--set", "kl_bond=1"], "kl_bond"),
+        ([NAME, "--set", "=1"], "parameter"),
+        ([NAME, "--set", "window=2.5"], "window = 2.5"),
+        ([NAME, "--set", "model=[1]"], "model = [1]"),
+        ([NAME, "--set", 'model="[/bold]"'], "[/bold]"),
+        ([NAME, "--set", "seed=3"], "seed"),
+        ([NAME, "--set", "recipe=paper"], "recipe"),
+        ([NAME, "--set", "periodic=0"], "periodic"),
+        ([NAME, "--set", "env=1"], "env"),
+        ([NAME, "--set", "threads=many"], "threads"),
+        ([NAME, "--periodic", "7"], "periodic coordinates [7]"),
+        ([NAME, "--iterations", "0"], "--iterations"),
+        ([NAME, "--iterations", "many"], "--iterations"),
+        ([NAME, "--seed", "-1"], "--seed"),
+        ([NAME, "--colour", "red"], "--colour"),
+    ],
+)
+def test_mistakes_are_named_and_leave_no_folder(
+    arguments: list[str], says: str, tmp_path: Path
+) -> None:
+    text = refused("train", *arguments, "--out", tmp_path / "run")
+    assert says in text
+    assert not (tmp_path / "run").exists()
+
+
+def test_train_needs_a_folder(tmp_path: Path) -> None:
+    assert "--out" in refused("train", NAME)
+    (tmp_path / "file").write_text("")
+    assert "file" in refused("train", NAME, "--out", tmp_path / "file", *TINY)
+    assert "file" in refused("train", NAME, "--out", tmp_path / "file" / "run", *TINY)
+
+
+# ---- resume -----------------------------------------------------------------------------------
+
+
+def test_resume_makes_the_updates_that_are_missing(run: Path) -> None:
+    code, text = call("resume", run, "--iterations", "3", "--no-report")
+    assert code == 0
+    assert "2 updates made, 1 to go" in text
+    assert iteration(run) == 3
+    before = (run / "policy.safetensors").read_bytes()
+    for more in ([], ["--iterations", "1"]):
+        code, text = call("resume", run, "--no-report", *more)
+        assert code == 0 and "0 to go" in text
+        assert (run / "policy.safetensors").read_bytes() == before
+
+
+def test_a_run_that_stopped_before_its_first_update_can_be_resumed(
+    run: Path, trained: Path
+) -> None:
+    for name in RUN_FILES - {"config.json"}:
+        (run / name).unlink()
+    for command in ("evaluate", "plot", "video"):
+        assert "kreps resume" in refused(command, run)
+    assert call("resume", run, "--no-report")[0] == 0
+    name = "policy.safetensors"
+    assert (run / name).read_bytes() == (trained / name).read_bytes()
+
+
+def test_an_interrupted_resume_gives_advice_that_goes_on(
+    run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.chdir(run.parent)
+    with monkeypatch.context() as patch:
+        patch.setattr(cli.KREPS, "learn", interrupt)
+        code, text = call("resume", "run", "--iterations", "4", "--no-report")
+    assert code == 130
+    assert "stopped after 2 of 4" in text
+    advice = text.split("go on with: kreps ")[1].split()
+    assert advice[:2] == ["resume", "run"]
+    assert call(*advice, "--no-report")[0] == 0
+    assert iteration(run) == 4
+
+
+@pytest.mark.parametrize("command", ["evaluate", "plot", "video"])
+def test_ctrl_c_in_other_commands_is_no_success_and_no_traceback(
+    command: str, run: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupt(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    for part in ("_evaluate", "_plot", "_film"):
+        monkeypatch.setattr(cli, part, interrupt)
+    assert call(command, run)[0] == 130
+
+
+def test_an_environment_that_fails_can_be_mended_and_the_run_resumed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = tmp_path / "run"
+    assert train(run, environment="kreps-tests/Short-v0", iterations=1)[0] == 0
+    monkeypatch.setattr(Short, "fails", True)
+    text = refused("resume", run, "--iterations", "2")
+    assert "the cable came off" in text and "kreps resume" in text
+    assert iteration(run) == 1
+    monkeypatch.setattr(Short, "fails", False)
+    assert call("resume", run, "--iterations", "2", "--no-report")[0] == 0
+    assert iteration(run) == 2
+
+
+# ---- evaluate, plot, video --------------------------------------------------------------------
+
+
+def test_evaluate_measures_both_policies(run: Path) -> None:
+    code, text = call("evaluate", run, "--episodes", "20", "--steps", "60", "--seed", "4")
+    assert code == 0
+    found = json.loads((run / "evaluation.json").read_text())
+    learner = kreps.KREPS.resume(run / "checkpoint.safetensors", gym.make(NAME))
+    policy = learner.state.policy
+    assert policy is not None and learner.env is not None
+    for name, acting in (("stochastic", policy), ("greedy", Greedy(policy))):
+        mine = evaluate(
+            learner.env,
+            learner.task,
+            acting,
+            restart_probability=0.02,
+            episodes=20,
+            steps=60,
+            seed=4,
+        )
+        assert found[name]["mean"] == pytest.approx(mine.mean, rel=1e-9)
+        assert found[name]["standard_error"] == pytest.approx(mine.standard_error, rel=1e-6)
+        assert f"{mine.mean:.4f}" in text
+    assert found["seed"] == 4 and found["iteration"] == 2
+    assert "--episodes" in refused("evaluate", run, "--episodes", "1")
+    assert "--steps" in refused("evaluate", run, "--steps", "0")
+
+
+def test_plot_draws_with_and_without_an_evaluation(run: Path) -> None:
+    code, text = call("plot", run)
+    assert code == 0
+    for name in ("learning_curve.png", "policy_maps.png"):
+        assert name in text.replace(" ", "")
+        assert (run / name).stat().st_size > 5000
+    without = (run / "learning_curve.png").read_bytes()
+    call("evaluate", run, "--episodes", "2", "--steps", "20")
+    assert call("plot", run)[0] == 0
+    assert (run / "learning_curve.png").read_bytes() != without
+    call("resume", run, "--iterations", "3", "--no-report")
+    assert call("plot", run)[0] == 0  # the evaluation is of an earlier policy now
+
+
+def test_video_films_as_many_steps_as_asked_for(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "film.gif"
+    assert call("video", run, "--steps", "4", "--out", out)[0] == 0
+    with Image.open(out) as film:
+        assert film.n_frames == 4
+        assert film.info["duration"] == 50
+    assert not (run / "video.gif").exists()
+    assert call("video", run, "--steps", "3", "--stochastic")[0] == 0
+    assert (run / "video.gif").exists()
+
+
+@pytest.mark.parametrize("out", ["film.mp4", "film", "run"])
+def test_films_that_cannot_be_written_are_refused(
+    out: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert out in refused("video", run, "--steps", "2", "--out", out)
+
+
+def test_a_film_into_a_missing_folder_is_made_or_refused(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "missing" / "film.gif"
+    code, _ = call("video", run, "--steps", "2", "--out", out)
+    assert code == (0 if out.exists() else 2)
+
+
+def test_pictures_that_cannot_be_written_are_an_error_of_the_library(run: Path) -> None:
+    for name in ("learning_curve.png", "video.gif"):
+        (run / name).mkdir()
+    assert "learning_curve.png" in refused("plot", run)
+    assert "video.gif" in refused("video", run, "--steps", "2")
+
+
+def test_an_environment_that_cannot_be_drawn_still_gets_its_report(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    options = ["--iterations", "1", "--out", run, *TINY]
+    code, text = call("train", "kreps-tests/Short-v0", *options)
+    assert code == 0
+    assert "1 updates from 6 roll-outs" in text
+    assert (run / "learning_curve.png").exists()
+    assert not (run / "policy_maps.png").exists()  # three-dimensional states
+    assert "pygame is not installed" in refused("video", run)
+
+
+# ---- folders that are no runs, and damaged ones -----------------------------------------------
+
+ON_RUNS = ["resume", "evaluate", "plot", "video"]
+
+
+@pytest.mark.parametrize("command", ON_RUNS)
+def test_a_folder_that_is_no_run_is_refused_with_a_remedy(command: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("hello")
+    for place in (tmp_path, tmp_path / "missing", tmp_path / "file"):
+        text = refused(command, place)
+        assert "not a run folder" in text and "kreps train" in text
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize("name", ["run[/red]", "run[red]"])
+def test_brackets_in_a_path_are_no_markup(name: str, tmp_path: Path) -> None:
+    assert name in refused("resume", tmp_path / name)
+
+
+def test_brackets_in_a_path_are_no_markup_where_all_is_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, text = train(Path("run[a]"), iterations=1)
+    assert code == 0 and "run[a]/policy.safetensors" in text
+    code, text = call("resume", "run[a]", "--no-report")
+    assert code == 0 and "run[a]: 1 updates made" in text
+
+
+CONFIG = {
+    "environment": NAME,
+    "iterations": 2,
+    "seed": 0,
+    "recipe": "default",
+    "settings": {},
+    "periodic": None,
+}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "",
+        "{",
+        "null",
+        "[]",
+        "{}",
+        "[" * 100_000,
+        "\0" * 100,
+        json.dumps({**CONFIG, "colour": "red"}),
+        json.dumps({**CONFIG, "environment": 7}),
+        json.dumps({**CONFIG, "environment": "nowhere/Nothing-v0"}),
+        json.dumps({**CONFIG, "iterations": "two"}),
+        json.dumps({**CONFIG, "seed": -1}),
+        json.dumps({**CONFIG, "seed": None}),
+        json.dumps({**CONFIG, "recipe": []}),
+        json.dumps({**CONFIG, "recipe": "cake"}),
+        json.dumps({**CONFIG, "settings": []}),
+        json.dumps({**CONFIG, "settings": {"seed": 1}}),
+        json.dumps({**CONFIG, "settings": {"kl_bound": "wide"}}),
+        json.dumps({**CONFIG, "periodic": 0}),
+        json.dumps({**CONFIG, "periodic": ["x"]}),
+        json.dumps({**CONFIG, "periodic": [9]}),
+    ],
+)
+def test_a_damaged_configuration_is_an_error_of_the_library(content: str, tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(content)
+    refused("resume", tmp_path, "--no-report")
+
+
+@pytest.mark.parametrize("command", ON_RUNS)
+def test_a_damaged_checkpoint_is_an_error_of_the_library(command: str, run: Path) -> None:
+    checkpoint = run / "checkpoint.safetensors"
+    checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
+    assert "checkpoint" in refused(command, run)
+    checkpoint.write_bytes((run / "policy.safetensors").read_bytes())
+    assert "it is a kreps policy" in refused(command, run)
+
+
+def test_a_checkpoint_of_another_task_is_refused(run: Path, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    train(other, environment="kreps-tests/Short-v0", iterations=1)
+    shutil.copy(other / "checkpoint.safetensors", run / "checkpoint.safetensors")
+    assert "learnt in" in refused("resume", run)
+
+
+def _without_column(text: str) -> str:
+    return "\n".join(line.split(",", 3)[3] for line in text.splitlines())
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: "",
+        lambda text: "\0" * 200,
+        lambda text: "iteration,foo\nabc,1\n",
+        lambda text: text.replace("\n1,", "\none,"),
+        lambda text: text[: len(text) // 2],
+        lambda text: text.splitlines()[0] + "\n",
+        _without_column,
+        lambda text: text.replace("BOUND_ACTIVE", '"' * 3),
+        lambda text: text + "1,2\n",
+    ],
+    ids=["empty", "zeros", "foreign", "word", "half", "heading", "columns", "quotes", "short row"],
+)
+def test_a_damaged_progress_file_is_no_traceback(damage: Callable[[str], str], run: Path) -> None:
+    progress = run / "progress.csv"
+    progress.write_text(damage(progress.read_text()))
+    assert call("plot", run)[0] in (0, 2)
+    assert call("resume", run, "--iterations", "3", "--no-report")[0] in (0, 2)
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "null", '{"iteration": 2}', "\0"])
+def test_a_damaged_evaluation_is_no_traceback(content: str, run: Path) -> None:
+    (run / "evaluation.json").write_text(content)
+    assert call("plot", run)[0] in (0, 2)
+
+
+# ---- in a real process ------------------------------------------------------------------------
+
+
+def test_errors_go_to_stderr_as_one_message_without_a_traceback(tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "kreps.cli", "evaluate", str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("error:") and "Traceback" not in done.stderr
+
+
+def test_the_installed_command_is_the_same() -> None:
+    command = Path(sys.executable).with_name("kreps")
+    if not command.exists():
+        pytest.skip("kreps is not installed as a command")
+    done = subprocess.run(
+        [command, "--help"], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.returncode == 0 and "train" in done.stdout

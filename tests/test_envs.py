@@ -1,0 +1,380 @@
+"""The swing-up in both forms, its physics and reference values, and restarts of any environment."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import kreps
+from kreps.arrays import FloatArray
+from kreps.data import TaskSpec
+from kreps.envs import swing_up
+from kreps.envs.references import REFERENCE_REWARDS
+from kreps.envs.swing_up import SwingUp, SwingUpBatch
+from kreps.errors import ConfigurationError
+from kreps.evaluation import discounted_average, evaluation_rollouts
+from kreps.policies import StochasticPolicy
+from kreps.rollout import task_of
+
+NAME = "kreps/SwingUp-v0"
+HANGING = (np.array([np.pi]), np.array([0.0]))
+
+
+@dataclass(frozen=True)
+class Constant:
+    """The same torque whatever the state."""
+
+    torque: float
+
+    def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
+        return np.full((len(states), 1), self.torque)
+
+
+@dataclass(frozen=True)
+class Uniform:
+    """Any torque within the limits, from a generator of its own."""
+
+    rng: np.random.Generator
+
+    def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
+        return self.rng.uniform(-swing_up.MAX_TORQUE, swing_up.MAX_TORQUE, (len(states), 1))
+
+
+def energy(theta: FloatArray, velocity: FloatArray) -> FloatArray:
+    """Kinetic and potential energy of the rod in J, zero at rest in the horizontal."""
+    return 0.5 * swing_up.INERTIA * velocity**2 + swing_up.WEIGHT_TORQUE * np.cos(theta)
+
+
+def average_reward(policy: StochasticPolicy, episodes: int = 200) -> float:
+    env = gym.make(NAME)
+    rollouts = evaluation_rollouts(env, task_of(env), policy, episodes=episodes, steps=400, seed=0)
+    return discounted_average(rollouts, 0.02).mean
+
+
+def lengths_of(env: gym.Env[Any, Any], action: Any, seeds: Sequence[int | None]) -> list[int]:
+    """Steps of one episode per seed, with restarts as the only reason to end."""
+    lengths = []
+    for seed in seeds:
+        env.reset(seed=seed)
+        steps, truncated = 0, False
+        while not truncated:
+            _, _, terminated, truncated, info = env.step(action)
+            steps += 1
+            assert not terminated
+            assert ("restart" in info) == truncated
+        assert info["restart"] is True
+        lengths.append(steps)
+    return lengths
+
+
+# ---- the environment as Gymnasium sees it -----------------------------------------------------
+
+
+def test_gymnasium_checker_finds_nothing_of_substance() -> None:
+    matters_of_taste = ("symmetric and normalized space", "value is -infinity", "value is infinity")
+    env = gym.make(NAME, render_mode="rgb_array")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        check_env(env.unwrapped, skip_render_check=False)
+    others = [
+        str(w.message) for w in caught if not any(t in str(w.message) for t in matters_of_taste)
+    ]
+    assert others == []
+
+
+def test_reset_starts_hanging_at_rest_and_step_returns_python_types() -> None:
+    env = gym.make(NAME)
+    observation, info = env.reset(seed=0)
+    np.testing.assert_array_equal(observation, [np.pi, 0.0])
+    assert info == {}
+    observation, reward, terminated, truncated, _ = env.step(np.array([5.0]))
+    assert observation.shape == (2,) and observation.dtype == np.float64
+    assert type(reward) is float
+    assert terminated is False and truncated is False
+
+
+def test_observations_handed_out_are_not_overwritten_by_later_steps() -> None:
+    env = SwingUp()
+    first, _ = env.reset(seed=0)
+    second = env.step(np.array([10.0]))[0]
+    kept = second.copy()
+    env.step(np.array([-10.0]))
+    np.testing.assert_array_equal(first, [np.pi, 0.0])
+    np.testing.assert_array_equal(second, kept)
+    second[:] = 99.0  # nor does the environment take back what it handed out
+    assert np.abs(env.step(np.array([0.0]))[0]).max() < 20.0
+
+
+def test_metadata_names_the_angle_and_labels_every_coordinate() -> None:
+    env = gym.make(NAME)
+    assert env.metadata["periodic_coordinates"] == (0,)
+    assert len(env.metadata["observation_labels"]) == 2
+    assert len(env.metadata["action_labels"]) == 1
+    assert env.metadata["render_fps"] == 20
+
+
+def test_rendering_is_a_picture_that_follows_the_state() -> None:
+    env = gym.make(NAME, render_mode="rgb_array")
+    env.reset(seed=0)
+    before = np.asarray(env.render())
+    assert before.shape == (240, 240, 3) and before.dtype == np.uint8
+    again = np.asarray(env.render())
+    np.testing.assert_array_equal(before, again)
+    for _ in range(4):
+        env.step(np.array([30.0]))
+    after = np.asarray(env.render())
+    assert (before != after).any(axis=2).sum() > 100
+
+
+def test_the_picture_shows_upright_above_and_a_positive_angle_on_the_left() -> None:
+    def centre_of_rod(theta: float) -> FloatArray:
+        env = SwingUp(render_mode="rgb_array")
+        env.reset(seed=0)
+        env._observation = np.array([theta, 0.0])
+        picture = env.render().astype(int)
+        rod = picture[..., 2] - picture[..., 0] > 60  # the rod is the only blue thing
+        return np.argwhere(rod).mean(axis=0) - 119.5  # rows downwards, columns to the right
+
+    row, column = centre_of_rod(0.0)
+    assert row < -30 and abs(column) < 3
+    row, column = centre_of_rod(np.pi / 2)
+    assert abs(row) < 3 and column < -30
+    assert SwingUp().render() is None
+
+
+# ---- both forms -------------------------------------------------------------------------------
+
+
+def test_batch_and_environment_give_the_same_trajectories_from_the_same_seeds() -> None:
+    seeds, steps = [3, 14, 159], 60
+    actions = np.random.default_rng(0).uniform(-45.0, 45.0, (steps, len(seeds), 1))
+    model = SwingUpBatch()
+    rngs = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
+    batch = model.initial(rngs)
+    envs = [gym.make(NAME) for _ in seeds]
+    for j, (env, seed) in enumerate(zip(envs, seeds, strict=True)):
+        np.testing.assert_array_equal(env.reset(seed=seed)[0], batch[j])
+    for t in range(steps):
+        batch, rewards, ends = model.step(batch, actions[t], rngs)
+        assert not ends.any()
+        for j, env in enumerate(envs):
+            observation, reward, *_ = env.step(actions[t, j])
+            np.testing.assert_array_equal(observation, batch[j])
+            assert reward == rewards[j]
+
+
+def test_a_batch_row_does_not_depend_on_the_rows_beside_it() -> None:
+    model = SwingUpBatch()
+    states = np.array([[np.pi, 0.0], [0.1, 2.0], [4.0, -3.0]])
+    actions = np.array([[5.0], [-30.0], [100.0]])
+    seeded = [np.random.default_rng(s) for s in range(3)]
+    together, rewards, _ = model.step(states, actions, seeded)
+    for j in range(3):
+        alone, reward, _ = model.step(
+            states[j : j + 1], actions[j : j + 1], [np.random.default_rng(j)]
+        )
+        np.testing.assert_array_equal(alone[0], together[j])
+        assert reward[0] == rewards[j]
+
+
+# ---- physics ----------------------------------------------------------------------------------
+
+
+def test_energy_is_conserved_without_friction_noise_and_torque(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(swing_up, "FRICTION", 0.0)
+    theta, velocity = np.array([np.pi - 2.0, 0.3, 1.5]), np.array([0.0, 0.5, 9.0])
+    start = energy(theta, velocity)
+    for _ in range(200):  # ten seconds
+        theta, velocity = swing_up.integrate(theta, velocity, np.zeros(3))
+    drift = np.abs(energy(theta, velocity) - start)
+    assert drift.max() < 1e-3  # of about 50 J; Euler steps would lose all of it
+
+
+def test_friction_only_takes_energy_away() -> None:
+    theta, velocity = np.array([0.5]), np.array([4.0])
+    left = [energy(theta, velocity)[0]]
+    for _ in range(60):
+        theta, velocity = swing_up.integrate(theta, velocity, np.zeros(1))
+        left.append(energy(theta, velocity)[0])
+    assert (np.diff(left) < 0).all()
+
+
+def test_the_integrator_has_order_four(monkeypatch: pytest.MonkeyPatch) -> None:
+    def after_one_second(sub_steps: int) -> FloatArray:
+        monkeypatch.setattr(swing_up, "SUB_STEPS", sub_steps)
+        theta, velocity = np.array([2.0]), np.array([1.0])
+        for _ in range(20):
+            theta, velocity = swing_up.integrate(theta, velocity, np.array([7.0]))
+        return np.concatenate([theta, velocity])
+
+    exact = after_one_second(64)
+    errors = [np.abs(after_one_second(k) - exact).max() for k in (1, 2, 4)]
+    assert errors[0] / errors[1] > 12.0  # 16 for order four, 8 for order three
+    assert errors[1] / errors[2] > 12.0
+
+
+def test_hanging_is_a_fixed_point_and_upright_is_an_unstable_one() -> None:
+    theta, velocity = HANGING
+    for _ in range(100):
+        theta, velocity = swing_up.integrate(theta, velocity, np.zeros(1))
+    assert abs(theta[0] - np.pi) < 1e-12 and abs(velocity[0]) < 1e-12
+    theta, velocity = np.array([1e-3, 0.0]), np.zeros(2)
+    for _ in range(10):
+        theta, velocity = swing_up.integrate(theta, velocity, np.zeros(2))
+    # I theta'' = G theta - k theta': half a second of the growing solution
+    ratio = swing_up.FRICTION / swing_up.INERTIA
+    rate = -ratio / 2 + np.sqrt(ratio**2 / 4 + swing_up.WEIGHT_TORQUE / swing_up.INERTIA)
+    assert theta[0] == pytest.approx(0.5e-3 * np.exp(0.5 * rate), rel=0.1)
+    assert theta[1] == 0.0
+
+
+def test_a_positive_torque_turns_counterclockwise_and_cannot_lift_the_pendulum_directly() -> None:
+    theta, velocity = HANGING
+    highest = np.pi
+    for _ in range(400):
+        theta, velocity = swing_up.integrate(theta, velocity, np.array([30.0]))
+        highest = max(highest, float(theta[0]))
+    assert np.pi + 0.5 < highest < 1.5 * np.pi  # it rises, but stays below the horizontal
+    # at rest the torque balances the weight
+    assert swing_up.WEIGHT_TORQUE * np.sin(theta[0] - np.pi) == pytest.approx(30.0, rel=0.05)
+
+
+def test_torque_beyond_the_limit_acts_and_costs_as_the_limit() -> None:
+    model = SwingUpBatch()
+    states = np.tile([2.0, -1.0], (2, 1))
+    for beyond, limit in ((500.0, 30.0), (-500.0, -30.0)):
+        rngs = [np.random.default_rng(0), np.random.default_rng(0)]
+        successors, rewards, _ = model.step(states, np.array([[beyond], [limit]]), rngs)
+        np.testing.assert_array_equal(successors[0], successors[1])
+        assert rewards[0] == rewards[1]
+        assert rewards[0] == pytest.approx(-10 * 2.0**2 - 0.1 - 0.001 * 30.0**2)
+
+
+def test_noise_has_variance_one_over_the_time_step_and_is_drawn_once_a_period(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    torques: list[FloatArray] = []
+
+    def record(
+        theta: FloatArray, velocity: FloatArray, torque: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        torques.append(torque)
+        return theta, velocity
+
+    monkeypatch.setattr(swing_up, "integrate", record)
+    rng, m = np.random.default_rng(0), 20_000
+    _, rewards, _ = SwingUpBatch().step(
+        np.tile([np.pi, 0.0], (m, 1)), np.full((m, 1), 40.0), [rng] * m
+    )
+    assert len(torques) == 1
+    noise = torques[0] - 30.0  # added after clipping, so that it can exceed the limit
+    assert noise.mean() == pytest.approx(0.0, abs=4 * np.sqrt(20.0 / m))
+    assert noise.var() == pytest.approx(20.0, abs=4 * 20.0 * np.sqrt(2.0 / m))
+    assert np.ptp(rewards) == 0.0  # the cost is of the command, not of the noise
+
+
+def test_the_wrapped_angle_stays_inside_the_observation_space() -> None:
+    space = SwingUp().observation_space
+    assert isinstance(space, gym.spaces.Box)
+    cut = -0.5 * np.pi
+    angles = np.array([0.0, np.pi, -np.pi, cut, np.nextafter(cut, -9), 1.5 * np.pi, 7.0, 100.0])
+    wrapped = swing_up.wrap_angle(angles)
+    assert (wrapped >= space.low[0]).all() and (wrapped <= space.high[0]).all()
+    np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angles), atol=1e-12)
+    assert swing_up.wrap_angle(np.array([np.pi]))[0] == np.pi
+    assert swing_up.wrap_angle(np.array([0.0]))[0] == 0.0
+
+
+def test_reference_value_of_the_lean_which_exists_on_one_side_only() -> None:
+    reference = REFERENCE_REWARDS[NAME]["the lean (constant torque)"]
+    assert average_reward(Constant(-30.0)) == pytest.approx(reference, abs=0.7)
+    # the reward is 10 theta^2 with theta cut at 3 pi / 2: leaning to larger angles costs more
+    assert average_reward(Constant(30.0)) < 2.0 * reference
+
+
+def test_reference_value_of_zero_torque() -> None:
+    reference = REFERENCE_REWARDS[NAME]["zero torque"]
+    assert average_reward(Constant(0.0)) == pytest.approx(reference, abs=0.7)
+
+
+def test_reference_value_of_uniformly_random_torque() -> None:
+    reference = REFERENCE_REWARDS[NAME]["uniformly random torque"]
+    policy = Uniform(np.random.default_rng(0))
+    assert average_reward(policy, episodes=400) == pytest.approx(reference, abs=0.7)
+
+
+# ---- restarts ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [NAME, "Pendulum-v1"])
+def test_restarts_come_after_49_steps_on_average_in_any_environment(name: str) -> None:
+    inside = gym.make(name, disable_env_checker=True).unwrapped  # without its own time limit
+    env = kreps.RandomRestart(inside)
+    action = np.zeros(1, dtype=np.float32)
+    lengths = np.array(lengths_of(env, action, range(150)))
+    assert lengths.min() >= 1
+    standard_error = np.sqrt(0.98) / 0.02 / np.sqrt(len(lengths))
+    assert lengths.mean() == pytest.approx(49.0, abs=3 * standard_error)
+
+
+def test_restarts_are_reproducible_by_seed_and_go_on_without_one() -> None:
+    def lengths(first: int) -> list[int]:
+        env = kreps.RandomRestart(SwingUp(), probability=0.1)
+        return lengths_of(env, np.zeros(1), [first, None, None, None])
+
+    assert lengths(5) == lengths(5)
+    assert lengths(5) != lengths(6)
+    assert len(set(lengths(5))) > 1  # an unseeded reset draws anew, not the same length again
+
+
+def test_an_unseeded_restart_wrapper_works() -> None:
+    env = kreps.RandomRestart(SwingUp(), probability=0.5)
+    assert lengths_of(env, np.zeros(1), [None])[0] >= 1
+
+
+def test_a_restart_keeps_the_true_successor_and_does_not_touch_the_task() -> None:
+    env, plain = kreps.RandomRestart(SwingUp(), probability=0.2), SwingUp()
+    np.testing.assert_array_equal(env.reset(seed=1)[0], plain.reset(seed=1)[0])
+    truncated, steps = False, 0
+    while not truncated:
+        observation, reward, _, truncated, _ = env.step(np.array([20.0]))
+        expected, expected_reward, *_ = plain.step(np.array([20.0]))
+        np.testing.assert_array_equal(observation, expected)
+        assert reward == expected_reward
+        steps += 1
+    assert steps > 1  # or this would compare a single step
+
+
+def test_a_real_end_is_not_relabelled_as_a_restart() -> None:
+    class EndsAtOnce(SwingUp):
+        def step(self, action: Any) -> Any:
+            observation, reward, _, truncated, info = super().step(action)
+            return observation, reward, True, truncated, info
+
+    env = kreps.RandomRestart(EndsAtOnce(), probability=0.999)  # due after one step
+    env.reset(seed=0)
+    _, _, terminated, truncated, info = env.step(np.zeros(1))
+    assert terminated and not truncated and "restart" not in info
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0, -0.1, 2.0, float("nan")])
+def test_an_impossible_restart_probability_is_refused(probability: float) -> None:
+    with pytest.raises(ConfigurationError, match="restart probability"):
+        kreps.RandomRestart(SwingUp(), probability)
+
+
+def test_the_task_that_the_learner_sees_is_that_of_the_environment() -> None:
+    task = task_of(kreps.RandomRestart(gym.make(NAME)))
+    assert isinstance(task, TaskSpec)
+    assert task.observation_size == 2 and task.periodic == (0,)
+    np.testing.assert_array_equal(task.action_low, [-30.0])
+    np.testing.assert_array_equal(task.action_high, [30.0])

@@ -1,0 +1,253 @@
+"""Pictures show what they say they show."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+import kreps
+from kreps import plotting
+from kreps.data import Rollout, TaskSpec
+from kreps.envs.references import REFERENCE_REWARDS
+from kreps.errors import ConfigurationError
+
+REFERENCES = REFERENCE_REWARDS["kreps/SwingUp-v0"]
+LABELS = (["angle", "velocity"], ["torque"])
+EVALUATION = {"stochastic": {"mean": -30.0}, "greedy": {"mean": -25.0}}
+
+
+def rows(count: int) -> list[dict[str, str]]:
+    return [
+        {
+            "iteration": str(i + 1),
+            "steps": str(100 * (i + 1)),
+            "average_reward": str(-90.0 + 10 * i),
+            "kl": str(0.9 - 0.1 * i),
+            "kl_bound": "1.0",
+            "effective_samples": str(20.0 + i),
+            "samples": "100",
+        }
+        for i in range(count)
+    ]
+
+
+@pytest.fixture(scope="module")
+def learnt() -> kreps.KREPS:
+    env = gym.make("kreps/SwingUp-v0")
+    learner = kreps.KREPS(env, initial_rollouts=6, rollouts_per_iteration=3, window=6)
+    return learner.learn(1, progress=False)
+
+
+def texts(figure: Figure) -> str:
+    return " | ".join(t.get_text() for axes in figure.axes for t in axes.texts).replace("\n", " ")
+
+
+def maps(learner: kreps.KREPS) -> Figure:
+    return plotting.policy_maps(learner.state, learner.task, *LABELS)
+
+
+def film(learner: kreps.KREPS, path: Path, steps: int = 5, **changes: Any) -> Path:
+    rng = np.random.default_rng(0)
+    arguments: dict[str, Any] = {
+        "frames": [rng.integers(0, 255, (24, 24, 3), dtype=np.uint8) for _ in range(steps)],
+        "observations": rng.normal(size=(steps, learner.task.observation_size)),
+        "actions": rng.normal(size=(steps, learner.task.action_size)),
+        "state": learner.state,
+        "task": learner.task,
+        "labels": LABELS[0],
+        "action_labels": LABELS[1],
+        "fps": 20.0,
+        "path": path,
+    }
+    return plotting.film(**{**arguments, **changes})
+
+
+# ---- learning curve ---------------------------------------------------------------------------
+
+
+def test_the_curve_shows_each_batch_at_the_data_its_policy_was_learnt_from() -> None:
+    figure = plotting.learning_curve(rows(3), {}, None, "title")
+    top, middle, bottom = figure.axes
+    np.testing.assert_array_equal(top.lines[0].get_xdata(), [0.0, 100.0, 200.0])
+    np.testing.assert_array_equal(top.lines[0].get_ydata(), [-90.0, -80.0, -70.0])
+    np.testing.assert_allclose(middle.lines[0].get_ydata(), [0.9, 0.8, 0.7])
+    np.testing.assert_allclose(middle.lines[1].get_ydata(), [1.0, 1.0, 1.0])
+    np.testing.assert_allclose(bottom.lines[0].get_ydata(), [0.20, 0.21, 0.22])
+    assert "title" in (top.get_title(loc="left") + top.get_title())
+
+
+def test_the_curve_names_every_reference_value_and_the_evaluation() -> None:
+    figure = plotting.learning_curve(rows(3), REFERENCES, EVALUATION, "title")
+    top = figure.axes[0]
+    said = texts(figure)
+    levels = [float(np.asarray(line.get_ydata())[0]) for line in top.lines]
+    for name, value in REFERENCES.items():
+        assert name in said and f"{value:g}" in said
+        assert value in levels
+    at_the_end = {
+        float(np.asarray(line.get_ydata())[0])
+        for line in top.lines
+        if list(np.asarray(line.get_xdata())) == [300.0]
+    }
+    assert at_the_end == {-30.0, -25.0}
+    labels = [t.get_text() for t in top.get_legend().get_texts()]
+    assert any("-25" in label and "greedy" in label for label in labels)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_short_runs_have_a_curve_too(count: int, tmp_path: Path) -> None:
+    figure = plotting.learning_curve(rows(count), REFERENCES, EVALUATION, "short")
+    path = plotting.save(figure, tmp_path / "curve.png")
+    with Image.open(path) as picture:
+        picture.load()
+        assert min(picture.size) > 400
+
+
+def test_the_names_of_reference_lines_do_not_overlap() -> None:
+    figure = plotting.learning_curve(rows(3), REFERENCES, EVALUATION, "title")
+    canvas = plotting.FigureCanvasAgg(figure)
+    canvas.draw()
+    boxes = [t.get_window_extent(canvas.get_renderer()) for t in figure.axes[0].texts]
+    assert len(boxes) == len(REFERENCES)
+    for i, box in enumerate(boxes):
+        for other in boxes[i + 1 :]:
+            assert not box.overlaps(other)
+        assert figure.bbox.fully_containsx(box.x0) and figure.bbox.fully_containsx(box.x1)
+
+
+def test_drawing_leaves_the_settings_of_others_alone(learnt: kreps.KREPS, tmp_path: Path) -> None:
+    from matplotlib import rcParams
+
+    before = dict(rcParams)
+    plotting.save(plotting.learning_curve(rows(2), {}, None, ""), tmp_path / "a.png")
+    plotting.save(maps(learnt), tmp_path / "b.png")
+    film(learnt, tmp_path / "c.gif", 2)
+    assert dict(rcParams) == before
+
+
+# ---- maps -------------------------------------------------------------------------------------
+
+
+def test_the_maps_show_policy_and_value_over_the_plane(learnt: kreps.KREPS, tmp_path: Path) -> None:
+    figure = maps(learnt)
+    panels = [axes for axes in figure.axes if axes.images]
+    titles = [axes.get_title(loc="left") + axes.get_title() for axes in panels]
+    assert [t.split()[-1] for t in titles] == ["mean", "deviation", "V"]
+    policy, value = learnt.policy.process, learnt.value_function
+    shown: list[Callable[[Any], Any]] = [
+        lambda s: np.clip(policy.mean(s)[:, 0], -30.0, 30.0),
+        lambda s: policy.standard_deviation(s)[:, 0],
+        value,
+    ]
+    for axes, function in zip(panels, shown, strict=True):
+        picture = axes.images[0]
+        values = np.asarray(picture.get_array())
+        left, right, bottom, top = picture.get_extent()
+        assert right - left == pytest.approx(2 * np.pi)  # a whole turn of the angle
+        n, m = values.shape
+        for i, j in ((0, 0), (n // 2, m // 3), (n - 1, m - 1)):
+            x, y = np.linspace(left, right, m)[j], np.linspace(bottom, top, n)[i]
+            assert values[i, j] == pytest.approx(function(np.array([[x, y]]))[0], abs=1e-6)
+        assert picture.origin == "lower"
+        latest = learnt.state.window.rollouts[-1].observations[0]
+        assert any(
+            np.asarray(line.get_xydata())[0].tolist() == latest.tolist() for line in axes.lines
+        )
+    assert plotting.save(figure, tmp_path / "maps.png").stat().st_size > 10_000
+
+
+def test_the_maps_draw_the_latest_roll_outs_without_lines_across_the_cut() -> None:
+    task = TaskSpec(2, [-1.0], [1.0], (0,))
+    observations = np.array([[4.4, 1.0], [4.6, 1.0], [-1.5, 1.0], [-1.3, 1.0]])
+    x, y = plotting._unwrapped(observations, task)
+    assert len(x) == 5 and np.isnan(x[2]) and np.isnan(y[2])
+    np.testing.assert_array_equal(x[[0, 1, 3, 4]], observations[:, 0])
+    plain = plotting._unwrapped(observations, TaskSpec(2, [-1.0], [1.0]))
+    np.testing.assert_array_equal(plain, observations.T)  # a jump of a length is a jump
+
+
+def test_the_maps_need_a_plane() -> None:
+    rng = np.random.default_rng(0)
+    learner = kreps.KREPS(TaskSpec(3, [-1.0], [1.0]))
+    learner.update([Rollout(rng.normal(size=(6, 3)), rng.normal(size=(5, 1)), rng.normal(size=5))])
+    with pytest.raises(ConfigurationError, match=r"two-dimensional.*3"):
+        maps(learner)
+
+
+@pytest.mark.filterwarnings("ignore:Attempting to set identical")
+def test_maps_of_a_coordinate_that_never_changed_can_be_drawn(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]))
+    observations = np.stack([rng.normal(size=30), np.full(30, 2.0)], axis=1)
+    learner.update([Rollout(observations, rng.normal(size=(29, 1)), rng.normal(size=29))])
+    plotting.save(maps(learner), tmp_path / "maps.png")
+
+
+# ---- film -------------------------------------------------------------------------------------
+
+
+def test_a_film_has_a_picture_per_step_at_the_speed_of_the_task(
+    learnt: kreps.KREPS, tmp_path: Path
+) -> None:
+    path = film(learnt, tmp_path / "a.gif", 5)
+    with Image.open(path) as pictures:
+        assert pictures.n_frames == 5
+        assert pictures.info["duration"] == 50
+        assert pictures.info["loop"] == 0
+        first = np.asarray(pictures.convert("RGB")).astype(int)
+        pictures.seek(4)
+        last = np.asarray(pictures.convert("RGB")).astype(int)
+    assert (np.abs(first - last).sum(axis=2) > 30).mean() > 0.02  # something moved
+
+
+def test_a_film_of_other_states_shows_the_camera_only(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    learner = kreps.KREPS(TaskSpec(3, [-1.0], [1.0]))
+    learner.update([Rollout(rng.normal(size=(6, 3)), rng.normal(size=(5, 1)), rng.normal(size=5))])
+    path = film(learner, tmp_path / "a.gif", 2, labels=["a", "b", "c"])
+    with Image.open(path) as pictures:
+        assert pictures.n_frames == 2
+
+
+def test_a_film_needs_a_name_that_ends_in_gif(learnt: kreps.KREPS, tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match=r"\.gif"):
+        film(learnt, tmp_path / "a.mp4")
+    assert list(tmp_path.iterdir()) == []
+
+
+# ---- every seed of a comparison ---------------------------------------------------------------
+
+
+def test_a_comparison_shows_every_seed_and_their_mean(tmp_path: Path) -> None:
+    data = [
+        {
+            "method": method,
+            "seed": seed,
+            "iteration": iteration,
+            "steps": 100 * iteration,
+            "stochastic": -50.0 + 10 * iteration + seed,
+            "greedy": -45.0 + 10 * iteration + seed,
+        }
+        for method in ("default", "paper")
+        for seed in (0, 1, 2)
+        for iteration in (1, 2)
+    ]
+    figure = plotting.comparison(data, REFERENCES, "title", "source")
+    assert len(figure.axes) == 4
+    stochastic = figure.axes[0]
+    curves = [line for line in stochastic.lines if len(np.asarray(line.get_xdata())) == 2]
+    drawn = {tuple(np.asarray(line.get_ydata(), dtype=float)) for line in curves}
+    assert {(-40.0 + s, -30.0 + s) for s in (0, 1, 2)} <= drawn
+    assert (-39.0, -29.0) in drawn  # the mean, which is seed 1 here
+    for name in ("default", "paper"):
+        assert any(name in a.get_title(loc="left") + a.get_title() for a in figure.axes)
+    plotting.save(figure, tmp_path / "comparison.png")
+    one = [row for row in data if row["seed"] == 0]
+    plotting.save(plotting.comparison(one, {}, "one seed", ""), tmp_path / "one.png")

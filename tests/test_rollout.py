@@ -1,0 +1,498 @@
+"""Collecting roll-outs: in batches and step by step, and from environments that misbehave."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import kreps
+from kreps.algorithms.reps import LearnerState
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec
+from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
+from kreps.policies import BangBang, StochasticPolicy
+from kreps.rollout import batch_model_of, collect, simulate, task_of, without_restarts
+from kreps.seeding import Purpose, generator, integer_seed
+
+TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
+
+
+class PointMass(gym.Env[Any, Any]):
+    """A plain environment: position and velocity, force within [-1, 1], noise on the force.
+
+    ``spoil(step, observation, reward)`` may raise or return something else, to break it.
+    """
+
+    def __init__(self, **metadata: Any) -> None:
+        self.metadata = {"render_modes": [], **metadata}
+        self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+        self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+        self.applied: list[Any] = []
+        self.spoil: Any = lambda step, observation, reward: (observation, reward)
+        self.steps = 0  # of all episodes
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.state = self.np_random.normal(size=2)
+        return self.spoil(self.steps, self.state.copy(), 0.0)[0], {}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        self.applied.append(action)
+        self.steps += 1
+        force = float(action[0]) + 0.1 * self.np_random.normal()
+        reward = -float(self.state @ self.state)
+        velocity = 0.9 * self.state[1] + 0.2 * force
+        self.state = np.array([self.state[0] + 0.2 * velocity, velocity])
+        observation, reward = self.spoil(self.steps, self.state.copy(), reward)
+        return observation, reward, False, False, {}
+
+
+class EndsBeyond(gym.Wrapper[Any, Any, Any, Any]):
+    """Terminates where the position leaves ``[-limit, limit]``."""
+
+    def __init__(self, env: gym.Env[Any, Any], limit: float) -> None:
+        super().__init__(env)
+        self.limit = limit
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        observation, reward, _, truncated, info = self.env.step(action)
+        return observation, reward, bool(abs(observation[0]) > self.limit), truncated, info
+
+
+class ThreeSteps:
+    """A batch model that counts up and really ends after three steps; with ways to break it."""
+
+    def __init__(self, fault: str = "") -> None:
+        self.fault = fault
+
+    def initial(self, rngs: Any) -> FloatArray:
+        return np.zeros((len(rngs), 3 if self.fault == "shape" else 2))
+
+    def step(self, x: FloatArray, u: FloatArray, rngs: Any) -> Any:
+        if self.fault == "raise":
+            raise RuntimeError("the simulator lost its licence")
+        successors = x + 1.0
+        if self.fault == "nan":
+            successors[0, 1] = np.nan
+        return successors, u[:, 0], successors[:, 0] >= 3.0
+
+
+class InBatches(PointMass):
+    def __init__(self, fault: str = "") -> None:
+        super().__init__()
+        self.batch_model = ThreeSteps(fault)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A state-dependent policy whose commands are often beyond the limits."""
+
+    scale: float
+
+    def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
+        return self.scale * (np.sin(states[:, :1]) - 0.3 * states[:, 1:] + noise)
+
+
+def collected(
+    env: gym.Env[Any, Any],
+    policy: StochasticPolicy,
+    count: int = 6,
+    seed: int = 0,
+    iteration: int = 0,
+    probability: float = 0.05,
+) -> list[Rollout]:
+    return collect(
+        env,
+        task_of(env),
+        policy,
+        count,
+        seed=seed,
+        iteration=iteration,
+        restart_probability=probability,
+    )
+
+
+def unchanged(learner: kreps.KREPS, before: LearnerState) -> bool:
+    return learner.state is before and len(before.window.rollouts) == before.window.capacity
+
+
+# ---- both collectors --------------------------------------------------------------------------
+
+
+def test_collecting_in_batches_and_step_by_step_gives_the_same_data() -> None:
+    env = gym.make("kreps/SwingUp-v0")
+    wrapped: gym.Env[Any, Any] = gym.Wrapper(env)
+    assert batch_model_of(env) is not None
+    assert batch_model_of(wrapped) is None
+    batch, single = collected(env, Linear(40.0)), collected(wrapped, Linear(40.0))
+    assert len(batch) == len(single) == 6
+    for a, b in zip(batch, single, strict=True):
+        assert len(a) == len(b)
+        np.testing.assert_allclose(a.observations, b.observations, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(a.actions, b.actions, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(a.rewards, b.rewards, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("make", [lambda: gym.make("kreps/SwingUp-v0"), PointMass])
+def test_data_match_an_independent_simulation(make: Any) -> None:
+    env = make()
+    policy, task = Linear(3.0), task_of(env)
+    rollouts = collected(env, policy, seed=3, iteration=2)
+    for j, rollout in enumerate(rollouts):
+        fresh = make()
+        noise = generator(3, Purpose.POLICY, 2, j)
+        observation, _ = fresh.reset(seed=integer_seed(3, Purpose.ENVIRONMENT, 2, j))
+        for t in range(len(rollout)):
+            np.testing.assert_allclose(rollout.observations[t], observation, rtol=0, atol=1e-9)
+            action = policy.act(np.array([observation]), noise.standard_normal((1, 1)))[0]
+            np.testing.assert_allclose(rollout.actions[t], action, rtol=0, atol=1e-9)
+            applied = task.clip(action).astype(env.action_space.dtype)
+            observation, reward, *_ = fresh.step(applied)
+            assert rollout.rewards[t] == pytest.approx(reward, abs=1e-9)
+        np.testing.assert_allclose(rollout.observations[-1], observation, rtol=0, atol=1e-9)
+
+
+def test_lengths_are_those_of_the_restart_wrapper_with_the_same_seeds() -> None:
+    rollouts = collected(PointMass(), Linear(1.0), seed=7, probability=0.1)
+    env = kreps.RandomRestart(PointMass(), 0.1)
+    for j, rollout in enumerate(rollouts):
+        env.reset(seed=integer_seed(7, Purpose.ENVIRONMENT, 0, j))
+        truncated, steps = False, 0
+        while not truncated:
+            *_, truncated, _ = env.step(np.zeros(1, np.float32))
+            steps += 1
+        assert len(rollout) == steps
+
+
+def test_seed_and_iteration_and_rollout_each_change_the_data() -> None:
+    first = collected(PointMass(), Linear(1.0))
+    same = collected(PointMass(), Linear(1.0))
+    other_seed = collected(PointMass(), Linear(1.0), seed=1)
+    other_iteration = collected(PointMass(), Linear(1.0), iteration=1)
+    for a, b in zip(first, same, strict=True):
+        np.testing.assert_array_equal(a.observations, b.observations)
+    for others in (other_seed, other_iteration):
+        for a, b in zip(first, others, strict=True):
+            assert not np.array_equal(a.observations[0], b.observations[0])
+            assert not np.array_equal(a.actions[0], b.actions[0])
+    starts = {tuple(r.observations[0]) for r in first}
+    assert len(starts) == len(first)
+
+
+def test_the_first_rollouts_do_not_depend_on_how_many_follow() -> None:
+    few, many = collected(PointMass(), Linear(1.0), 2), collected(PointMass(), Linear(1.0), 5)
+    for a, b in zip(few, many, strict=False):
+        np.testing.assert_array_equal(a.observations, b.observations)
+        np.testing.assert_array_equal(a.actions, b.actions)
+
+
+def test_commands_are_stored_unclipped_while_the_environment_gets_them_clipped() -> None:
+    env = PointMass()
+    rollouts = collected(env, Linear(5.0))
+    commanded = np.concatenate([r.actions for r in rollouts])
+    applied = np.array(env.applied)
+    assert np.abs(commanded).max() > 5.0  # so there was something to clip
+    assert all(a.shape == (1,) and a.dtype == np.float32 for a in env.applied)
+    np.testing.assert_array_equal(applied, np.clip(commanded, -1.0, 1.0).astype(np.float32))
+
+
+def test_commands_of_the_batch_are_stored_unclipped_too() -> None:
+    rollouts = collected(gym.make("kreps/SwingUp-v0"), Linear(200.0))
+    commanded = np.concatenate([r.actions for r in rollouts])
+    assert np.abs(commanded).max() > 100.0
+    for rollout in rollouts:
+        torque = np.clip(rollout.actions[:, 0], -30.0, 30.0)
+        states = rollout.observations[:-1]
+        cost = 10 * states[:, 0] ** 2 + 0.1 * states[:, 1] ** 2 + 0.001 * torque**2
+        np.testing.assert_allclose(rollout.rewards, -cost, rtol=1e-12)
+
+
+# ---- ends -------------------------------------------------------------------------------------
+
+
+def test_a_real_end_is_recorded_with_its_successor_and_other_ends_are_not() -> None:
+    rollouts = collected(EndsBeyond(PointMass(), 1.2), Linear(2.0), count=20)
+    ended = [r for r in rollouts if r.terminated]
+    cut = [r for r in rollouts if not r.terminated]
+    assert ended and cut  # of both kinds, or this shows nothing
+    for rollout in ended:
+        assert abs(rollout.observations[-1, 0]) > 1.2
+    for rollout in cut:
+        assert (np.abs(rollout.observations[1:, 0]) <= 1.2).all()
+
+
+def test_truncation_by_a_time_limit_is_no_real_end() -> None:
+    env = gym.wrappers.TimeLimit(PointMass(), 4)
+    rollouts = collected(env, Linear(1.0), probability=0.01)
+    assert max(len(r) for r in rollouts) == 4
+    assert not any(r.terminated for r in rollouts)
+
+
+def test_real_ends_in_a_batch_stop_their_own_rollout_only() -> None:
+    env = InBatches()
+    lengths = [1, 7, 3, 2]
+    rollouts = simulate(
+        env,
+        task_of(env),
+        Linear(1.0),
+        [0, 1, 2, 3],
+        [np.random.default_rng(j) for j in range(4)],
+        lengths,
+    )
+    assert [len(r) for r in rollouts] == [1, 3, 3, 2]
+    assert [r.terminated for r in rollouts] == [False, True, True, False]
+    np.testing.assert_array_equal(rollouts[1].observations[:, 0], [0.0, 1.0, 2.0, 3.0])
+
+
+def test_progress_of_collecting_is_told() -> None:
+    env, told = PointMass(), list[int]()
+    collect(
+        env,
+        task_of(env),
+        BangBang(task_of(env)),
+        3,
+        seed=0,
+        iteration=0,
+        restart_probability=0.2,
+        on_rollout=told.append,
+    )
+    assert told == [1, 2, 3]
+
+
+# ---- spaces -----------------------------------------------------------------------------------
+
+BOX = gym.spaces.Box(-1.0, 1.0, (1,))
+
+
+class Spaces(PointMass):
+    def __init__(self, observations: Any, actions: Any) -> None:
+        super().__init__()
+        self.observation_space, self.action_space = observations, actions
+
+
+@pytest.mark.parametrize(
+    ("observations", "actions", "which", "remedy"),
+    [
+        (BOX, gym.spaces.Discrete(3), "action space is Discrete(3)", "TransformAction"),
+        (BOX, gym.spaces.MultiBinary(2), "action space is MultiBinary(2)", "continuous form"),
+        (gym.spaces.Dict({"a": BOX}), BOX, "observation space is Dict(", "FlattenObservation"),
+        (gym.spaces.Discrete(5), BOX, "observation space is Discrete(5)", "FlattenObservation"),
+        (BOX, gym.spaces.Box(-np.inf, np.inf, (2,)), "unbounded", "bounded Box"),
+        (BOX, gym.spaces.Box(0.0, np.inf, (1,)), "unbounded", "bounded Box"),
+    ],
+)
+def test_spaces_that_cannot_be_served_say_which_why_and_what_to_do(
+    observations: Any, actions: Any, which: str, remedy: str
+) -> None:
+    with pytest.raises(SpaceError) as caught:
+        kreps.KREPS(Spaces(observations, actions))
+    message = str(caught.value)
+    assert which in message
+    assert remedy in message
+    assert "needed" in message or "needs" in message  # why
+    assert isinstance(caught.value, ConfigurationError)
+
+
+def test_the_remedy_for_dictionaries_works() -> None:
+    space = gym.spaces.Dict({"a": BOX, "b": gym.spaces.Box(-1.0, 1.0, (2,))})
+    env = gym.wrappers.FlattenObservation(Spaces(space, BOX))
+    assert kreps.KREPS(env).task.observation_size == 3
+
+
+def test_observations_and_actions_of_many_dimensions_are_flattened() -> None:
+    class Picture(Spaces):
+        def __init__(self) -> None:
+            super().__init__(
+                gym.spaces.Box(0, 255, (2, 3), np.uint8), gym.spaces.Box(-1.0, 2.0, (2, 2))
+            )
+
+        def reset(self, **kwargs: Any) -> Any:
+            return np.arange(6, dtype=np.uint8).reshape(2, 3), {}
+
+        def step(self, action: Any) -> Any:
+            assert action.shape == (2, 2) and action.dtype == np.float32
+            return np.full((2, 3), 7, np.uint8), float(action[0, 1]), False, False, {}
+
+    env = Picture()
+    task = task_of(env)
+    assert task.observation_size == 6 and task.action_size == 4
+    rollout = collected(env, BangBang(task), count=1)[0]
+    assert rollout.observations.shape[1] == 6 and rollout.actions.shape[1] == 4
+    np.testing.assert_array_equal(rollout.observations[0], np.arange(6.0))
+    np.testing.assert_array_equal(rollout.rewards, rollout.actions[:, 1])
+
+
+def test_periodic_coordinates_come_from_metadata_or_by_keyword() -> None:
+    assert task_of(PointMass()).periodic == ()
+    assert task_of(PointMass(periodic_coordinates=(1,))).periodic == (1,)
+    assert task_of(PointMass(periodic_coordinates=(1,)), [0]).periodic == (0,)
+    assert task_of(PointMass(periodic_coordinates=(1,)), []).periodic == ()
+    assert kreps.KREPS(PointMass(), periodic=[0, 1]).task.periodic == (0, 1)
+    with pytest.raises(ConfigurationError, match=r"periodic coordinates \[2\]"):
+        kreps.KREPS(PointMass(), periodic=[2])
+
+
+def test_periodic_coordinates_reach_policy_and_value_function() -> None:
+    class Spinning(PointMass):
+        metadata: ClassVar[dict[str, Any]] = {"periodic_coordinates": (0,)}
+
+    learner = kreps.KREPS(Spinning(), periodic=[0], **TINY).learn(1, progress=False)
+    turn = np.array([2 * np.pi, 0.0])
+    states = np.random.default_rng(0).normal(size=(5, 2))
+    policy = learner.policy
+    np.testing.assert_allclose(
+        policy.predict(states, deterministic=True)[0],
+        policy.predict(states + turn, deterministic=True)[0],
+        atol=1e-6,
+    )
+    np.testing.assert_allclose(
+        learner.value_function(states), learner.value_function(states + turn), atol=1e-6
+    )
+
+
+# ---- restarts ---------------------------------------------------------------------------------
+
+
+def test_an_outermost_restart_wrapper_gives_the_learner_its_probability() -> None:
+    env = PointMass()
+    inside, probability = without_restarts(kreps.RandomRestart(env, 0.07))
+    assert inside is env and probability == 0.07
+    assert without_restarts(env) == (env, None)
+    learner = kreps.KREPS(kreps.RandomRestart(env, 0.07), seed=0)
+    assert learner.settings.restart_probability == 0.07
+    assert learner.env is env  # restarts are not made twice
+
+
+def test_a_restart_wrapper_below_another_one_is_refused_with_its_remedy() -> None:
+    env = gym.wrappers.TimeLimit(kreps.RandomRestart(PointMass()), 100)
+    with pytest.raises(ConfigurationError, match="outermost"):
+        kreps.KREPS(env)
+
+
+# ---- environments that misbehave ---------------------------------------------------------------
+
+
+def raise_at(step: int) -> Any:
+    def spoil(now: int, observation: Any, reward: Any) -> Any:
+        if now == step:
+            raise RuntimeError("motor 3 is on fire")
+        return observation, reward
+
+    return spoil
+
+
+def replace_at(step: int, observation: Any = None, reward: Any = None) -> Any:
+    def spoil(now: int, true_observation: Any, true_reward: Any) -> Any:
+        if now < step:
+            return true_observation, true_reward
+        return (
+            true_observation if observation is None else np.array(observation),
+            true_reward if reward is None else reward,
+        )
+
+    return spoil
+
+
+def sound(now: int, observation: Any, reward: Any) -> Any:
+    return observation, reward
+
+
+def test_an_environment_that_raises_loses_nothing_and_learning_goes_on_once_mended() -> None:
+    env = PointMass()
+    learner = kreps.KREPS(env, seed=1, **TINY).learn(1, progress=False)
+    before = learner.state
+    env.spoil = raise_at(env.steps + 10)
+    with pytest.raises(EnvironmentFailure, match=r"RuntimeError.*roll-out.*motor 3") as caught:
+        learner.learn(1, progress=False)
+    assert isinstance(caught.value.__cause__, RuntimeError)
+    assert unchanged(learner, before)
+    env.spoil = sound
+    learner.learn(1, progress=False)
+    untroubled = kreps.KREPS(PointMass(), seed=1, **TINY).learn(2, progress=False)
+    states = np.random.default_rng(0).normal(size=(4, 2))
+    np.testing.assert_array_equal(
+        learner.policy.predict(states, deterministic=True)[0],
+        untroubled.policy.predict(states, deterministic=True)[0],
+    )
+
+
+def test_an_environment_that_raises_on_reset_is_a_failure_too() -> None:
+    env = PointMass()
+    env.spoil = raise_at(0)
+    with pytest.raises(EnvironmentFailure, match="after 0 steps: motor 3"):
+        kreps.KREPS(env, **TINY).learn(1, progress=False)
+
+
+def test_a_keyboard_interrupt_in_the_environment_stays_one() -> None:
+    def interrupt(now: int, observation: Any, reward: Any) -> Any:
+        raise KeyboardInterrupt
+
+    env = PointMass()
+    env.spoil = interrupt
+    with pytest.raises(KeyboardInterrupt):
+        kreps.KREPS(env, **TINY).learn(1, progress=False)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "says"),
+    [
+        ({"observation": [np.nan, 0.0]}, "NaN"),
+        ({"observation": [0.0, np.inf]}, "NaN, an infinity"),
+        ({"reward": np.nan}, "rewards hold NaN"),
+        ({"reward": -np.inf}, "rewards hold NaN, an infinity"),
+        ({"observation": [0.0, 0.0, 0.0]}, "3"),
+        ({"observation": [0.0]}, "1"),
+    ],
+)
+def test_bad_data_from_an_environment_are_refused_and_change_nothing(
+    spoilt: dict[str, Any], says: str
+) -> None:
+    env = PointMass()
+    learner = kreps.KREPS(env, seed=1, **TINY).learn(1, progress=False)
+    before = learner.state
+    env.spoil = replace_at(env.steps + 10, **spoilt)
+    with pytest.raises(DataError, match=r"roll-out \d+") as caught:
+        learner.learn(1, progress=False)
+    assert says in str(caught.value)
+    assert unchanged(learner, before)
+    env.spoil = sound
+    learner.learn(1, progress=False)
+    assert learner.state.iteration == 2
+
+
+@pytest.mark.parametrize(
+    ("observation", "says"), [([np.nan, 0.0], "NaN"), ([0.0, 0.0, 0.0], "3"), ([], "0")]
+)
+def test_a_bad_first_observation_is_named_as_such(observation: list[float], says: str) -> None:
+    env = PointMass()
+    env.spoil = replace_at(0, observation=observation)
+    with pytest.raises(DataError, match="observation") as caught:
+        kreps.KREPS(env, **TINY).learn(1, progress=False)
+    assert says in str(caught.value)
+
+
+def test_a_batch_that_raises_is_a_failure_of_the_environment() -> None:
+    with pytest.raises(EnvironmentFailure, match="lost its licence"):
+        kreps.KREPS(InBatches("raise"), **TINY).learn(1, progress=False)
+
+
+@pytest.mark.parametrize("fault", ["nan", "shape"])
+def test_a_batch_with_bad_data_is_refused(fault: str) -> None:
+    learner = kreps.KREPS(InBatches(fault), **TINY)
+    before = learner.state
+    with pytest.raises(DataError):
+        learner.learn(1, progress=False)
+    assert learner.state is before
+
+
+def test_spec_of_the_task_is_that_of_its_box_whatever_the_data_type() -> None:
+    task = task_of(PointMass())
+    assert isinstance(task, TaskSpec)
+    assert task.action_low.dtype == np.float64
+    np.testing.assert_array_equal(task.action_scale, [1.0])
