@@ -331,7 +331,7 @@ def test_ctrl_c_in_other_commands_is_no_success_and_no_traceback(
     def interrupt(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    for part in ("_evaluate", "_plot", "_film"):
+    for part in ("evaluate_run", "plot_run", "film_run"):
         monkeypatch.setattr(cli, part, interrupt)
     assert call(command, run)[0] == 130
 

@@ -5,31 +5,33 @@ from __future__ import annotations
 import json
 import sys
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
-import gymnasium as gym
-import numpy as np
 import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from kreps.controller import Policy
-from kreps.data import TaskSpec
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import ConfigurationError, EnvironmentFailure, KrepsError
-from kreps.evaluation import Evaluation, evaluate, stochastic_and_greedy
 from kreps.experiments.runner import cells_of, commit, run_cells, write_results
 from kreps.experiments.specs import EXPERIMENTS
 from kreps.learner import KREPS
+from kreps.report import (
+    console,
+    evaluate_run,
+    film_run,
+    make_environment,
+    plot_run,
+    report_run,
+    say,
+)
 from kreps.rollout import Environment
 from kreps.runs import RunConfig, RunFolder
 from kreps.settings import settings_of
-from kreps.storage import write_atomically
-from kreps.threads import blas_threads
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -38,7 +40,6 @@ app = typer.Typer(
     help="Kernel-based, non-parametric policy search: REPS with RKHS embeddings.\n\n"
     "[bold]Start here:[/bold]  kreps train kreps/SwingUp-v0 --out runs/swing-up",
 )
-console = Console()
 
 RunArgument = Annotated[Path, typer.Argument(help="Folder of the run.", show_default=False)]
 
@@ -83,7 +84,7 @@ def train(
         settings=dict(_setting(text) for text in set_),
         periodic=periodic or None,
     )
-    env = _make(environment)
+    env = make_environment(environment)
     learner = _learner(config, env)  # settings are checked before a folder is made
     folder = RunFolder(out)
     folder.create(config)
@@ -105,7 +106,7 @@ def resume(
     """Go on with a run exactly where it stopped, as if it never had."""
     folder = RunFolder(run)
     config = folder.config()
-    env = _make(config.environment)
+    env = make_environment(config.environment)
     if folder.checkpoint_file.exists():
         learner = KREPS.resume(folder.checkpoint_file, env)
     else:  # stopped before the first update
@@ -131,14 +132,14 @@ def evaluate_(
     """Average reward per step of the learnt policy, with and without its exploration noise."""
     folder = RunFolder(run)
     learner = _learnt(folder)
-    _evaluate(folder, learner, episodes, steps, seed)
+    evaluate_run(folder, learner, episodes, steps, seed)
 
 
 @app.command(epilog="Example:\n\n  kreps plot runs/swing-up")
 def plot(run: RunArgument) -> None:
     """Draw the learning curve and, for two-dimensional states, maps of policy and V."""
     folder = RunFolder(run)
-    for path in _plot(folder, _learnt(folder)):
+    for path in plot_run(folder, _learnt(folder)):
         say(f"drew {path}")
 
 
@@ -158,7 +159,7 @@ def video(
 ) -> None:
     """Film the learnt policy in its environment."""
     folder = RunFolder(run)
-    say(f"filmed {_film(folder, _learnt(folder), steps, stochastic, seed, out)}")
+    say(f"filmed {film_run(folder, _learnt(folder), steps, stochastic, seed, out)}")
 
 
 @app.command(
@@ -235,11 +236,6 @@ def main() -> None:
 # ---- parts ------------------------------------------------------------------------------------
 
 
-def say(message: str) -> None:
-    """Plain words: no markup, as paths may hold brackets; no line breaks, as they may be long."""
-    console.print(message, markup=False, highlight=False, soft_wrap=True)
-
-
 def _setting(text: str) -> tuple[str, Any]:
     """``name=value``; the value is read as JSON where it can be."""
     name, equals, value = text.partition("=")
@@ -249,16 +245,6 @@ def _setting(text: str) -> tuple[str, Any]:
         return name, json.loads(value)
     except ValueError:
         return name, value
-
-
-def _make(environment: str, **options: Any) -> Environment:
-    try:
-        return gym.make(environment, **options)
-    except Exception as error:  # whatever a foreign environment raises
-        raise ConfigurationError(
-            f"cannot make the environment {environment!r}: {error}; check its name, "
-            "or write module:name to have its module imported first"
-        ) from error
 
 
 def _learner(config: RunConfig, env: Environment) -> KREPS:
@@ -280,7 +266,7 @@ def _learnt(folder: RunFolder) -> KREPS:
             f"{folder.path} has no checkpoint yet; make the first update with "
             f"`kreps resume {folder.path}`"
         )
-    return KREPS.resume(folder.checkpoint_file, _make(config.environment))
+    return KREPS.resume(folder.checkpoint_file, make_environment(config.environment))
 
 
 def _learn(folder: RunFolder, learner: KREPS, target: int, report: bool) -> None:
@@ -299,151 +285,9 @@ def _learn(folder: RunFolder, learner: KREPS, target: int, report: bool) -> None
         say(f"once it is mended, go on with: kreps resume {folder.path}")
         raise
     if report:
-        _report(folder, learner)
+        report_run(folder, learner)
     else:
         say(f"policy: {folder.policy_file}")
-
-
-def _report(folder: RunFolder, learner: KREPS) -> None:
-    evaluation = _evaluate(folder, learner, episodes=200, steps=400, seed=0)
-    pictures = _plot(folder, learner)
-    try:
-        pictures.append(_film(folder, learner, 120, False, 0, None))
-    except (ConfigurationError, EnvironmentFailure) as error:
-        say(f"no film: {error}")
-    state = learner.state
-    greedy = evaluation["greedy"].mean
-    say(
-        f"\n{state.iteration} updates from {state.rollouts} roll-outs "
-        f"({state.steps} environment steps). The learnt policy earns {greedy:.4g} per step "
-        f"without noise and {evaluation['stochastic'].mean:.4g} with it."
-        + _in_words(folder.config().environment, greedy)
-    )
-    say(f"Policy:    {folder.policy_file}  (kreps.load_policy reads it)")
-    say(f"Numbers:   {folder.progress_file}, {folder.evaluation_file}")
-    for path in pictures:
-        say(f"Picture:   {path}")
-    say(f"Go on:     kreps resume {folder.path} --iterations {2 * state.iteration}")
-
-
-def _in_words(environment: str, reward: float) -> str:
-    """How the reward stands to the task's reference values."""
-    references = REFERENCE_REWARDS.get(environment)
-    if not references:
-        return ""
-    (best_name, best), *others = references.items()
-    worst_name, worst = others[-1]
-    way = (reward - worst) / (best - worst)
-    text = (
-        f" That is {way:.0%} of the way from {worst_name} ({worst:g}) "
-        f"to the {best_name} ({best:g})."
-    )
-    for name, value in others[:-1]:
-        if abs(reward - value) < 0.05 * abs(best - worst):
-            text += f" It is near {name} ({value:g}): the run is probably stuck there."
-    return text
-
-
-def _evaluate(
-    folder: RunFolder, learner: KREPS, episodes: int, steps: int, seed: int
-) -> dict[str, Evaluation]:
-    assert learner.env is not None and learner.state.policy is not None
-    found = {}
-    with console.status("evaluating ..."), blas_threads(1):
-        for name, policy in stochastic_and_greedy(learner.state.policy).items():
-            found[name] = evaluate(
-                learner.env,
-                learner.task,
-                policy,
-                restart_probability=learner.settings.restart_probability,
-                episodes=episodes,
-                steps=steps,
-                seed=seed,
-            )
-    table = Table(title=f"Average reward per step, {episodes} roll-outs of up to {steps} steps")
-    for heading in ("policy", "mean", "± 2 s.e."):
-        table.add_column(heading)
-    for name, result in found.items():
-        table.add_row(name, f"{result.mean:.4f}", f"{2 * result.standard_error:.4f}")
-    console.print(table)
-    content = {
-        "iteration": learner.state.iteration,
-        "environment_steps": learner.state.steps,
-        "seed": seed,
-        **{name: asdict(result) for name, result in found.items()},
-    }
-    write_atomically(folder.evaluation_file, (json.dumps(content, indent=2) + "\n").encode())
-    return found
-
-
-def _labels(env: Environment, task: TaskSpec) -> tuple[list[str], list[str]]:
-    metadata = env.metadata or {}
-    observations = metadata.get("observation_labels") or [
-        f"observation {i}" for i in range(task.observation_size)
-    ]
-    actions = metadata.get("action_labels") or [f"action {i}" for i in range(task.action_size)]
-    return list(observations), list(actions)
-
-
-def _plot(folder: RunFolder, learner: KREPS) -> list[Path]:
-    from kreps import plotting
-
-    assert learner.env is not None
-    environment = folder.config().environment
-    rows = folder.rows()
-    if not rows:
-        raise ConfigurationError(f"{folder.progress_file} holds no iteration to draw")
-    evaluation = folder.evaluation(learner.state.iteration)
-    with console.status("drawing ..."):
-        curve = plotting.learning_curve(
-            rows, REFERENCE_REWARDS.get(environment, {}), evaluation, environment
-        )
-        drawn = [plotting.save(curve, folder.path / "learning_curve.png")]
-        if learner.task.observation_size == 2:
-            maps = plotting.policy_maps(
-                learner.state, learner.task, *_labels(learner.env, learner.task)
-            )
-            drawn.append(plotting.save(maps, folder.path / "policy_maps.png"))
-    return drawn
-
-
-def _film(
-    folder: RunFolder, learner: KREPS, steps: int, stochastic: bool, seed: int, out: Path | None
-) -> Path:
-    from kreps import plotting
-
-    env = _make(folder.config().environment, render_mode="rgb_array")
-    policy = Policy(learner.policy.process, seed)
-    frames, observations, actions = [], [], []
-    with console.status("filming ..."):
-        try:
-            observation, _ = env.reset(seed=seed)
-            for _ in range(steps):
-                action, _ = policy.predict(observation.ravel(), deterministic=not stochastic)
-                frames.append(env.render())
-                observations.append(observation.ravel())
-                actions.append(action)
-                space = env.action_space
-                observation, _, terminated, truncated, _ = env.step(
-                    action.astype(space.dtype).reshape(space.shape or ())
-                )
-                if terminated or truncated:
-                    break
-        except Exception as error:  # whatever a foreign environment raises
-            raise EnvironmentFailure(
-                f"the environment cannot be filmed, it raised {type(error).__name__}: {error}"
-            ) from error
-        return plotting.film(
-            frames,
-            observations=np.array(observations),
-            actions=np.array(actions),
-            state=learner.state,
-            task=learner.task,
-            labels=_labels(env, learner.task)[0],
-            action_labels=_labels(env, learner.task)[1],
-            fps=float(env.metadata.get("render_fps", 20)),
-            path=out or folder.path / "video.gif",
-        )
 
 
 if __name__ == "__main__":

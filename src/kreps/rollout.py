@@ -151,7 +151,7 @@ def _simulate_batch(
     rewards = np.empty((longest, len(ends)))
     t = 0
     try:
-        observations[0] = model.initial(rngs)
+        observations[0] = _states(model.initial(rngs), len(ends), task)
         for t in range(longest):
             live = np.flatnonzero(ends > t)
             if len(live) == 0:
@@ -161,12 +161,7 @@ def _simulate_batch(
             successors, rewards[t, live], done = model.step(
                 observations[t, live], task.clip(actions[t, live]), [rngs[int(j)] for j in live]
             )
-            if np.shape(successors) != (len(live), task.observation_size):
-                raise DataError(
-                    f"the batch model returned observations of shape {np.shape(successors)}, but "
-                    f"({len(live)}, {task.observation_size}) is needed"
-                )
-            observations[t + 1, live] = successors
+            observations[t + 1, live] = _states(successors, len(live), task)
             ends[live[done]] = t + 1
             terminated[live[done]] = True
     except DataError:
@@ -220,6 +215,15 @@ def _failure(error: Exception, where: str, steps: int) -> EnvironmentFailure:
         f"the environment raised {type(error).__name__} in {where}, after {steps} steps: {error}; "
         "what was learnt before is kept, so mend the environment and call learn() again"
     )
+
+
+def _states(observations: FloatArray, count: int, task: TaskSpec) -> FloatArray:
+    if np.shape(observations) != (count, task.observation_size):
+        raise DataError(
+            f"the batch model returned observations of shape {np.shape(observations)}, but "
+            f"({count}, {task.observation_size}) is needed"
+        )
+    return observations
 
 
 def _state(observation: Any, task: TaskSpec) -> FloatArray:
