@@ -243,7 +243,8 @@ def test_progress_prints_a_line_per_iteration_where_there_is_no_terminal(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     learner = swing_up().learn(2)
-    lines = capsys.readouterr().out.splitlines()
+    *lines, last = capsys.readouterr().out.splitlines()
+    assert last.startswith("CPU seconds: rollouts ")
     assert len(lines) == 2
     for number, line in enumerate(lines, 1):
         assert line.startswith(f"iter {number} ")
@@ -496,3 +497,25 @@ def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem() -> N
     assert sorted(shares)[3] < 1.15  # at least four of five within 15 %
     assert max(shares) < 1.5
     assert first > 10 * max(shares)
+
+
+def test_what_contradicts_itself_is_refused() -> None:
+    task = kreps.TaskSpec(2, [-1.0], [1.0])
+    with pytest.raises(ConfigurationError, match="periodic"):
+        kreps.KREPS(task, periodic=(0,))
+    restarting = kreps.RandomRestart(gym.make("kreps/SwingUp-v0"), 0.1)
+    assert kreps.KREPS(restarting).settings.restart_probability == 0.1
+    with pytest.raises(ConfigurationError, match="restart_probability"):
+        kreps.KREPS(restarting, restart_probability=0.02)
+    with pytest.raises(ConfigurationError, match="threads"):
+        kreps.KREPS(task, threads="many")  # type: ignore[arg-type]
+    for stranger in ("Pendulum-v1", None, 3):
+        with pytest.raises(ConfigurationError, match="gymnasium"):
+            kreps.KREPS(stranger)  # type: ignore[arg-type]
+
+
+def test_settings_can_be_given_whole() -> None:
+    settings = kreps.Settings(kl_bound=0.3, window=7)
+    task = kreps.TaskSpec(2, [-1.0], [1.0])
+    assert kreps.KREPS(task, recipe=settings).settings == settings
+    assert kreps.KREPS(task, recipe=settings, window=9).settings.window == 9

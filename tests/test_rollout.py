@@ -13,7 +13,9 @@ import kreps
 from kreps.algorithms.reps import LearnerState
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec
+from kreps.envs.swing_up import SwingUp
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
+from kreps.evaluation import discounted_average
 from kreps.policies import BangBang, StochasticPolicy
 from kreps.rollout import batch_model_of, collect, simulate, task_of, without_restarts
 from kreps.seeding import Purpose, generator, integer_seed
@@ -496,3 +498,28 @@ def test_spec_of_the_task_is_that_of_its_box_whatever_the_data_type() -> None:
     assert isinstance(task, TaskSpec)
     assert task.action_low.dtype == np.float64
     np.testing.assert_array_equal(task.action_scale, [1.0])
+
+
+class Painful(SwingUp):
+    """Steps in its own way: the inherited batch form knows nothing of that."""
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        observation, _, terminated, truncated, info = super().step(action)
+        return observation, -12345.0, terminated, truncated, info
+
+
+def test_a_subclass_that_steps_in_its_own_way_is_not_simulated_in_batches() -> None:
+    learner = kreps.KREPS(Painful(), **TINY).learn(1, progress=False)
+    rewards = np.concatenate([r.rewards for r in learner.state.window.rollouts])
+    np.testing.assert_array_equal(rewards, -12345.0)
+    assert batch_model_of(SwingUp()) is SwingUp.batch_model
+
+
+def test_rollouts_that_end_early_count_by_their_weight() -> None:
+    # one step of reward 1, then a restart; a hundred steps of reward 0
+    short = Rollout(np.zeros((2, 1)), np.zeros((1, 1)), np.ones(1), terminated=True)
+    long = Rollout(np.zeros((101, 1)), np.zeros((100, 1)), np.zeros(100))
+    found = discounted_average([short, long], 0.02)
+    assert found.mean == pytest.approx(1.0 / (1.0 + (1.0 - 0.98**100) / 0.02))
+    alike = discounted_average([long, long, long], 0.02)
+    assert (alike.mean, alike.standard_error) == (0.0, 0.0)

@@ -15,8 +15,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+import kreps
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import ConfigurationError, EnvironmentFailure, KrepsError
+from kreps.evaluation import EPISODES, STEPS
 from kreps.experiments.runner import cells_of, commit, run_cells, write_results
 from kreps.experiments.specs import EXPERIMENTS
 from kreps.learner import KREPS
@@ -44,13 +46,22 @@ app = typer.Typer(
 RunArgument = Annotated[Path, typer.Argument(help="Folder of the run.", show_default=False)]
 
 
+@app.callback(invoke_without_command=True)
+def options(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        say(f"kreps {kreps.__version__}")
+        raise typer.Exit
+
+
 # ---- commands ---------------------------------------------------------------------------------
 
 
 @app.command(
     epilog="Examples:\n\n"
     "  kreps train kreps/SwingUp-v0 --iterations 20 --seed 0 --out runs/swing-up\n\n"
-    "  kreps train kreps/SwingUp-v0 --recipe paper --out runs/as-printed\n\n"
+    "  kreps train kreps/SwingUp-v0 --recipe paper --out runs/paper-like\n\n"
     "  kreps train Pendulum-v1 --set kl_bound=0.5 --set window=60 --out runs/pendulum\n\n"
     "  kreps train my_robot.envs:Arm-v0 --periodic 0 --periodic 1 --out runs/arm"
 )
@@ -61,7 +72,9 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder for the run; must not hold one yet.")],
     iterations: Annotated[int, typer.Option(min=1, help="Policy updates to make.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same policy.")] = 0,
-    recipe: Annotated[str, typer.Option(help="default, or paper: the printed method.")] = "default",
+    recipe: Annotated[
+        str, typer.Option(help="default, or paper: close to the printed method.")
+    ] = "default",
     set_: Annotated[
         list[str],
         typer.Option("--set", metavar="NAME=VALUE", help="Change one setting; may be repeated."),
@@ -125,8 +138,8 @@ def resume(
 )
 def evaluate_(
     run: RunArgument,
-    episodes: Annotated[int, typer.Option(min=2, help="Roll-outs per policy.")] = 200,
-    steps: Annotated[int, typer.Option(min=1, help="Steps of each, without restarts.")] = 400,
+    episodes: Annotated[int, typer.Option(min=2, help="Roll-outs per policy.")] = EPISODES,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of each, without restarts.")] = STEPS,
     seed: Annotated[int, typer.Option(min=0, help="Of the evaluation's random numbers.")] = 0,
 ) -> None:
     """Average reward per step of the learnt policy, with and without its exploration noise."""

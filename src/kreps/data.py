@@ -21,7 +21,7 @@ def is_sane(values: FloatArray) -> BoolArray:
     return np.abs(values) <= LARGEST
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TaskSpec:
     """What the learner must know of a task; everything else it learns.
 
@@ -40,12 +40,13 @@ class TaskSpec:
         object.__setattr__(self, "action_low", np.array(self.action_low, np.float64, ndmin=1))
         object.__setattr__(self, "action_high", np.array(self.action_high, np.float64, ndmin=1))
         try:
-            object.__setattr__(
-                self, "periodic", tuple(sorted(operator.index(i) for i in self.periodic))
-            )
+            periodic = tuple(sorted({operator.index(i) for i in self.periodic}))
+            object.__setattr__(self, "periodic", periodic)
+            object.__setattr__(self, "observation_size", operator.index(self.observation_size))
         except TypeError as error:
             raise ConfigurationError(
-                f"periodic = {self.periodic!r}, but it must list numbers of coordinates, as (0, 2)"
+                f"observation_size = {self.observation_size!r} and periodic = {self.periodic!r}, "
+                "but a whole number and a list of whole numbers are needed, as 3 and (0, 2)"
             ) from error
         if self.observation_size < 1:
             raise ConfigurationError(
@@ -87,7 +88,7 @@ class TaskSpec:
         return np.clip(actions, self.action_low, self.action_high)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rollout:
     """One roll-out of ``T >= 1`` steps, copied at construction so that no buffer can overwrite it.
 
@@ -151,7 +152,7 @@ class Rollout:
             )
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Transitions:
     """The n steps of some roll-outs as flat arrays; states are named by row of ``points``.
 

@@ -22,7 +22,7 @@ class DualProblem:
 
     Attributes:
         rewards: (n,) rewards R in units of their standard deviation, largest one zero.
-        differences: (n, r) rows ``E[phi(s') | s_i, a_i] - phi(s_i)``: B.
+        differences: (n, r) rows ``E[phi(s') | s_i, a_i] - phi(s_i)``, restarts included: B.
         kl_bound: epsilon, in nats.
         ridge: rho.
         eta_floor: least temperature, in the units of the rewards.  Where the optimum lies
@@ -83,11 +83,10 @@ def dual_gradient(problem: DualProblem, eta: float, theta: FloatArray) -> tuple[
 
 
 def dual_hessian(problem: DualProblem, eta: float, theta: FloatArray) -> FloatArray:
-    """Hessian (r + 1, r + 1) in ``(theta, log eta)`` coordinates at fixed scale.
+    """Hessian (r + 1, r + 1) in ``(theta, eta)``, the eta row and column multiplied by eta.
 
-    That is the Hessian in ``(theta, eta)`` with the eta row and column multiplied by eta, which
-    makes it one symmetric product: with ``J = sqrt(p) [B - E_p B, -(delta - E_p delta)]`` it is
-    ``J'J / eta`` plus rho on the diagonal of theta.
+    So scaled it is one symmetric product: with ``J = sqrt(p) [B - E_p B, -(delta - E_p delta)]``
+    it is ``J'J / eta`` plus rho on the diagonal of theta.
     """
     delta = bellman_errors(problem, theta)
     p = sample_weights(delta, eta)

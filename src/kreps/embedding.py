@@ -51,7 +51,8 @@ class KernelEmbedding:
 
         By ``K = (K + lambda I) - lambda I`` this is ``F' - lambda (K_sa + lambda I)^-1 F'``.
         """
-        return successor_features - self.regulariser * self.factor.solve(successor_features)
+        added = self.regulariser + self.factor.jitter
+        return successor_features - added * self.factor.solve(successor_features)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,10 @@ from kreps.policies import CostSensitiveGP, StochasticPolicy
 from kreps.rollout import Environment, simulate, without_restarts
 from kreps.seeding import Purpose, generator, integer_seed
 
+EPISODES = 200
+STEPS = 400
+"""Of a full evaluation: 400 steps hold all but 3e-4 of the weight at p = 0.02."""
+
 
 @dataclass(frozen=True)
 class Greedy:
@@ -60,19 +64,19 @@ def evaluation_rollouts(
 
 
 def discounted_average(rollouts: Sequence[Rollout], restart_probability: float) -> Evaluation:
-    """Weigh the rewards of each roll-out by ``gamma^t``, normalised by the sum of the weights.
+    """All rewards weighted by ``gamma^t``, over the sum of all weights.
 
-    A roll-out that really ends is followed by a restart: its weights stop there.
+    A roll-out that really ends is followed by a restart: its weights stop there, so roll-outs count
+    by their weight (renewal reward).  The standard error is that of a ratio (delta method).
     """
-    averages = []
-    for rollout in rollouts:
-        weights = (1.0 - restart_probability) ** np.arange(len(rollout))
-        averages.append(weights @ rollout.rewards / weights.sum())
-    values = np.array(averages)
-    error = float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else 0.0
-    return Evaluation(
-        float(values.mean()), error, len(values), max(len(rollout) for rollout in rollouts)
-    )
+    count = len(rollouts)
+    weights = [(1.0 - restart_probability) ** np.arange(len(rollout)) for rollout in rollouts]
+    lengths = np.array([w.sum() for w in weights])
+    gains = np.array([w @ rollout.rewards for w, rollout in zip(weights, rollouts, strict=True)])
+    mean = float(gains.sum() / lengths.sum())
+    scatter = (gains - mean * lengths) / lengths.mean()
+    error = float(scatter.std(ddof=1) / np.sqrt(count)) if count > 1 else 0.0
+    return Evaluation(mean, error, count, max(len(rollout) for rollout in rollouts))
 
 
 def stochastic_and_greedy(policy: CostSensitiveGP) -> dict[str, StochasticPolicy]:
@@ -86,8 +90,8 @@ def evaluate(
     policy: StochasticPolicy,
     *,
     restart_probability: float,
-    episodes: int = 200,
-    steps: int = 400,
+    episodes: int = EPISODES,
+    steps: int = STEPS,
     seed: int = 0,
 ) -> Evaluation:
     """Evaluate a policy by ``episodes`` roll-outs of ``steps`` steps each."""

@@ -63,10 +63,11 @@ class KREPS:
             `TaskSpec` if all data comes through `update`.  The learner restarts it at random as
             in the paper (Sec. 4.1), so it need not end by itself.
         seed: of everything random; the same seed gives the same policy, byte for byte.
-        recipe: ``"default"`` or ``"paper"``, the printed method; see `kreps.RECIPES`.
+        recipe: ``"default"``, ``"paper"`` (close to the printed method) or a `kreps.Settings`.
         periodic: coordinates of the observation that are angles in rad; None asks the
             environment's ``metadata["periodic_coordinates"]``.
-        threads: BLAS threads while learning; None leaves BLAS as it is.
+        threads: BLAS threads while learning; None leaves BLAS as it is.  Another number may
+            change the last bits of a policy.
         **settings: any field of `kreps.Settings`, such as ``kl_bound``.
 
     Raises:
@@ -79,7 +80,7 @@ class KREPS:
         env: Environment | TaskSpec,
         *,
         seed: int = 0,
-        recipe: str = "default",
+        recipe: str | Settings = "default",
         periodic: Sequence[int] | None = None,
         threads: int | None = 1,
         **settings: Any,
@@ -87,16 +88,33 @@ class KREPS:
         self.seed = _whole("seed", seed)
         self.env: Environment | None = None
         if isinstance(env, TaskSpec):
+            if periodic is not None:
+                raise ConfigurationError(
+                    f"periodic = {periodic!r} beside a TaskSpec, which names them itself; "
+                    "write TaskSpec(..., periodic=...)"
+                )
             self.task = env
         else:
-            self.env, restart_probability = without_restarts(env)
             self.task = task_of(env, periodic)
-            if restart_probability is not None:
-                settings.setdefault("restart_probability", restart_probability)
+            self.env, probability = without_restarts(env)
+            if probability is not None:
+                asked = settings.setdefault("restart_probability", probability)
+                if asked != probability:
+                    raise ConfigurationError(
+                        f"restart_probability = {asked!r}, but the environment's RandomRestart has "
+                        f"{probability!r}; give one of them"
+                    )
         self.settings: Settings = settings_of(recipe, **settings)
-        self.threads = threads
+        self.threads = None if threads is None else max(1, _whole("threads", threads))
         self.state = LearnerState(Window(self.settings.window))
         self._policy: Policy | None = None
+
+    def __repr__(self) -> str:
+        state = self.state
+        return (
+            f"<KREPS seed {self.seed}: {state.iteration} updates from {state.rollouts} roll-outs "
+            f"({state.steps} steps)>"
+        )
 
     @property
     def policy(self) -> Policy:

@@ -82,6 +82,12 @@ def inverse_lower(lower: FloatArray) -> FloatArray:
     return inverse
 
 
+def qr_factor(a: FloatArray) -> FloatArray:
+    """R (k, k) of the QR decomposition of a tall (n, k) matrix: ``R'R = A'A``, but never formed."""
+    r: FloatArray = np.linalg.qr(a, mode="r")  # type: ignore[assignment]
+    return r
+
+
 @dataclass(frozen=True)
 class PivotedCholesky:
     """``columns @ columns.T`` approximates the matrix; exact on the rows named by ``pivots``.

@@ -151,6 +151,12 @@ def policy_maps(
     return figure
 
 
+def check_film_name(path: Path) -> None:
+    """Raise `ConfigurationError` unless the name ends in ``.gif``."""
+    if path.suffix != ".gif":
+        raise ConfigurationError(f"{path.name!r} is no film; end its name in .gif")
+
+
 def film(
     frames: Sequence[Any],
     observations: FloatArray,
@@ -170,8 +176,7 @@ def film(
         fps: pictures per second of the environment.
         path: ending in ``.gif``.
     """
-    if path.suffix != ".gif":
-        raise ConfigurationError(f"{path.name!r} is no film; end its name in .gif")
+    check_film_name(path)
     plane = task.observation_size == 2
     with rc_context({**STYLE, "figure.constrained_layout.use": False}):
         figure = Figure(figsize=(7.6 if plane else 3.8, 3.6), dpi=80)

@@ -17,6 +17,7 @@ from kreps.linalg import (
     cholesky,
     inverse_lower,
     pivoted_cholesky,
+    qr_factor,
     solve_lower,
     solve_lower_transposed,
 )
@@ -179,7 +180,7 @@ class Predictor:
         columns = policy.signal * chosen.columns
         mean_weights = solve_lower_transposed(lower, columns.T @ policy.alpha)
         # k' C^-1 k = |L^-1 columns phi|^2 = |R phi|^2 with R from the QR of L^-1 columns
-        r: FloatArray = np.linalg.qr(solve_lower(policy.factor.lower, columns), mode="r")  # type: ignore[assignment]
+        r = qr_factor(solve_lower(policy.factor.lower, columns))
         return cls(
             kernel,
             kernel.embed(states[chosen.pivots]),

@@ -16,18 +16,31 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from kreps.dual import Outcome
 from kreps.settings import Settings
 
 if TYPE_CHECKING:
     from kreps.learner import KREPS, IterationReport
 
-COLUMNS = ("iter", "steps", "reward", "KL / bound", "eta", "ESS", "gap", "CPU s")
+COLUMNS = ("iter", "steps", "reward", "KL / bound", "eta", "ESS", "gap", "CPU s", "note")
 SHOWN_ROWS = 24
 
 
 def seconds_by_stage(report: IterationReport) -> dict[str, float]:
     """CPU seconds of one iteration, roll-outs included."""
     return {"rollouts": report.rollout_seconds, **report.update.seconds}
+
+
+def note_of(report: IterationReport) -> str:
+    """What is out of the ordinary about an update, in a few words."""
+    notes = {
+        Outcome.AT_FLOOR: "eta at its floor",
+        Outcome.FALLBACK: "by bisection",
+        Outcome.NOT_CONVERGED: "NOT CONVERGED",
+    }
+    note = notes.get(report.update.dual.outcome, "")
+    jitter = report.update.jitter
+    return f"{note}  jitter {jitter:.0e}".strip() if jitter else note
 
 
 class ProgressTable:
@@ -64,6 +77,8 @@ class ProgressTable:
             self._bar.update(self._task, note="")
             self._live.update(self._layout(), refresh=True)
             self._live.stop()
+        elif self._stages:
+            print(self._stage_line(), flush=True)
 
     def rollouts_done(self, count: int) -> None:
         self._bar.update(self._task, note=f"{count} roll-outs")
@@ -82,6 +97,7 @@ class ProgressTable:
             f"{report.update.effective_samples:.0f}",
             f"{dual.gap:.0e}",
             f"{sum(stages.values()):.2f}",
+            note_of(report),
         )
         if self._console.is_terminal:
             self._rows.append(row)
@@ -89,19 +105,21 @@ class ProgressTable:
             self._live.update(self._layout())
         else:
             pairs = zip(COLUMNS, row, strict=True)
-            print("  ".join(f"{name} {value}" for name, value in pairs), flush=True)
+            print("  ".join(f"{name} {value}" for name, value in pairs if value), flush=True)
 
     def _layout(self) -> Table:
         table = Table(box=None, pad_edge=False)
         for name in COLUMNS:
-            table.add_column(name, justify="right")
+            table.add_column(name, justify="left" if name == "note" else "right")
         for row in self._rows[-SHOWN_ROWS:]:
             table.add_row(*row)
         whole = Table.grid()
         whole.add_row(table)
         if self._stages:
-            total = sum(self._stages.values())
-            shares = ", ".join(f"{name} {s / total:.0%}" for name, s in self._stages.items())
-            whole.add_row(f"[dim]CPU {total:.1f} s: {shares}[/dim]")
+            whole.add_row(f"[dim]{self._stage_line()}[/dim]")
         whole.add_row(self._bar)
         return whole
+
+    def _stage_line(self) -> str:
+        stages = ", ".join(f"{name} {s:.1f}" for name, s in self._stages.items())
+        return f"CPU seconds: {stages}"

@@ -14,11 +14,11 @@ from rich.table import Table
 
 from kreps.controller import Policy
 from kreps.data import TaskSpec
-from kreps.envs.references import REFERENCE_REWARDS
+from kreps.envs.references import REFERENCE_RESTART_PROBABILITY, REFERENCE_REWARDS
 from kreps.errors import ConfigurationError, EnvironmentFailure
-from kreps.evaluation import Evaluation, evaluate, stochastic_and_greedy
+from kreps.evaluation import EPISODES, STEPS, Evaluation, evaluate, stochastic_and_greedy
 from kreps.learner import KREPS
-from kreps.rollout import Environment
+from kreps.rollout import Environment, batch_model_of
 from kreps.runs import RunFolder
 from kreps.storage import write_atomically
 from kreps.threads import blas_threads
@@ -42,7 +42,13 @@ def make_environment(environment: str, **options: Any) -> Environment:
 
 
 def report_run(folder: RunFolder, learner: KREPS) -> None:
-    evaluation = evaluate_run(folder, learner, episodes=200, steps=400, seed=0)
+    assert learner.env is not None
+    if batch_model_of(learner.env) is None:  # steps may be slow, or those of a robot
+        episodes, steps = 10, 200
+        say(f"a short evaluation; `kreps evaluate {folder.path}` makes a full one")
+    else:
+        episodes, steps = EPISODES, STEPS
+    evaluation = evaluate_run(folder, learner, episodes, steps, seed=0)
     pictures = plot_run(folder, learner)
     try:
         pictures.append(film_run(folder, learner, 120, False, 0, None))
@@ -54,7 +60,7 @@ def report_run(folder: RunFolder, learner: KREPS) -> None:
         f"\n{state.iteration} updates from {state.rollouts} roll-outs "
         f"({state.steps} environment steps). The learnt policy earns {greedy:.4g} per step "
         f"without noise and {evaluation['stochastic'].mean:.4g} with it."
-        + _in_words(folder.config().environment, greedy)
+        + _in_words(_references(folder, learner), greedy)
     )
     say(f"Policy:    {folder.policy_file}  (kreps.load_policy reads it)")
     say(f"Numbers:   {folder.progress_file}, {folder.evaluation_file}")
@@ -63,9 +69,15 @@ def report_run(folder: RunFolder, learner: KREPS) -> None:
     say(f"Go on:     kreps resume {folder.path} --iterations {2 * state.iteration}")
 
 
-def _in_words(environment: str, reward: float) -> str:
+def _references(folder: RunFolder, learner: KREPS) -> dict[str, float]:
+    """The task's reference values, where they are of the process that was learnt on."""
+    if learner.settings.restart_probability != REFERENCE_RESTART_PROBABILITY:
+        return {}
+    return REFERENCE_REWARDS.get(folder.config().environment, {})
+
+
+def _in_words(references: dict[str, float], reward: float) -> str:
     """How the reward stands to the task's reference values."""
-    references = REFERENCE_REWARDS.get(environment)
     if not references:
         return ""
     (best_name, best), *others = references.items()
@@ -126,14 +138,13 @@ def plot_run(folder: RunFolder, learner: KREPS) -> list[Path]:
     from kreps import plotting
 
     assert learner.env is not None
-    environment = folder.config().environment
     rows = folder.rows()
     if not rows:
         raise ConfigurationError(f"{folder.progress_file} holds no iteration to draw")
     evaluation = folder.evaluation(learner.state.iteration)
     with console.status("drawing ..."):
         curve = plotting.learning_curve(
-            rows, REFERENCE_REWARDS.get(environment, {}), evaluation, environment
+            rows, _references(folder, learner), evaluation, folder.config().environment
         )
         drawn = [plotting.save(curve, folder.path / "learning_curve.png")]
         if learner.task.observation_size == 2:
@@ -149,6 +160,8 @@ def film_run(
 ) -> Path:
     from kreps import plotting
 
+    path = out or folder.path / "video.gif"
+    plotting.check_film_name(path)
     env = make_environment(folder.config().environment, render_mode="rgb_array")
     policy = Policy(learner.policy.process, seed)
     frames, observations, actions = [], [], []
@@ -170,6 +183,8 @@ def film_run(
             raise EnvironmentFailure(
                 f"the environment cannot be filmed, it raised {type(error).__name__}: {error}"
             ) from error
+        finally:
+            env.close()
         return plotting.film(
             frames,
             observations=np.array(observations),
@@ -179,5 +194,5 @@ def film_run(
             labels=_labels(env, learner.task)[0],
             action_labels=_labels(env, learner.task)[1],
             fps=float(env.metadata.get("render_fps", 20)),
-            path=out or folder.path / "video.gif",
+            path=path,
         )

@@ -6,7 +6,7 @@ Both ways address their randomness by roll-out, so they give the same data from 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -81,7 +81,13 @@ def batch_model_of(env: Environment) -> BatchModel | None:
     transparent = (gym.wrappers.PassiveEnvChecker, gym.wrappers.OrderEnforcing)
     while isinstance(env, transparent):
         env = env.env
-    return getattr(env, "batch_model", None)
+    if "batch_model" in vars(env):
+        return cast(BatchModel, vars(env)["batch_model"])
+    for owner in type(env).__mro__:
+        if "batch_model" in vars(owner):  # a subclass that steps in its own way is not served by it
+            same = all(getattr(type(env), n) is getattr(owner, n) for n in ("step", "reset"))
+            return cast(BatchModel, vars(owner)["batch_model"]) if same else None
+    return None
 
 
 def collect(

@@ -1,8 +1,9 @@
 """A run folder: what was asked for, how it went, and everything needed to go on.
 
-``config.json`` is written once; after each iteration ``progress.csv``, ``policy.safetensors`` and
-then ``checkpoint.safetensors`` are replaced, each atomically.  The checkpoint is what counts: the
-others are never behind it, and rows ahead of it are dropped on resuming.
+``config.json`` says what was asked for; after each iteration ``progress.csv``,
+``policy.safetensors`` and then ``checkpoint.safetensors`` are replaced, each atomically.  The
+checkpoint is what counts: the others are never behind it, and rows ahead of it are dropped on
+resuming.  In ``progress.csv`` eta, dual, primal and gap are in standard deviations of the reward.
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ COLUMNS = (
     "effective_samples",
     "samples",
     "rank",
+    "rank_residual",
     "support",
     "dual",
     "primal",
@@ -211,6 +213,7 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "effective_samples": info.effective_samples,
         "samples": info.samples,
         "rank": info.rank,
+        "rank_residual": info.rank_residual,
         "support": info.support,
         "dual": dual.dual,
         "primal": dual.primal,

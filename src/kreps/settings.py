@@ -23,13 +23,13 @@ class Settings:
         kl_bound: epsilon of Eq. 2 in nats: how far one update may move from the samples.
         eta_floor: least temperature, in standard deviations of the reward.  Near convergence the
             optimum of the dual falls to zero and the KL bound would chase noise; a floor lets the
-            bound go slack instead.  0 is the printed update.
+            bound go slack instead.  0 leaves only a numerical safeguard of 1e-6.
         ridge: rho times the number of samples; the softness of the stationarity constraint.
         model: transition model, ``"embedding"`` (Eq. 4) or ``"sample"`` (the observed successor).
         features: of V, ``"rkhs"`` (Eq. 3) or ``"grid"`` (fixed radial basis functions).
         grid_size: centres per coordinate of the grid.
-        policy_fit: ``"map"``, maximum a posteriori hyper-parameters of the policy, or
-            ``"bounded"``, maximum likelihood within hard ranges.
+        policy_fit: hyper-parameters of the policy by leave-one-out density, ``"map"`` with priors
+            or ``"bounded"`` within hard ranges.
         exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``.
         exploration_scale: standard deviation of the Gaussian one, in units of half the range.
         restart_probability: p; a roll-out lasts (1 - p) / p steps on expectation.
@@ -94,17 +94,19 @@ RECIPES: dict[str, Settings] = {
     "default": Settings(),
     "paper": Settings(kl_bound=0.5, eta_floor=0.02, policy_fit="bounded"),
 }
-"""``"paper"`` follows the printed method, but for a small safeguard against a vanishing temperature
-(``eta_floor=0`` takes it away); docs/deviations.md says what ``"default"`` changes."""
+"""``"paper"`` follows the printed method where it is printed, with a low floor against a vanishing
+temperature (``eta_floor=0`` takes it away); docs/deviations.md says what ``"default"`` changes."""
 
 
-def settings_of(recipe: str = "default", /, **changes: Any) -> Settings:
-    """The named recipe with some parameters changed.
+def settings_of(recipe: str | Settings = "default", /, **changes: Any) -> Settings:
+    """The named (or given) recipe with some parameters changed.
 
     Raises:
         ConfigurationError: unknown recipe or parameter, or a value out of range.
     """
-    if not isinstance(recipe, str) or recipe not in RECIPES:
+    if isinstance(recipe, str) and recipe in RECIPES:
+        recipe = RECIPES[recipe]
+    if not isinstance(recipe, Settings):
         raise ConfigurationError(
             f"recipe {recipe!r} is unknown; choose one of {', '.join(map(repr, RECIPES))}"
         )
@@ -114,4 +116,4 @@ def settings_of(recipe: str = "default", /, **changes: Any) -> Settings:
         raise ConfigurationError(
             f"unknown parameter {', '.join(unknown)}; the parameters are {', '.join(known)}"
         )
-    return replace(RECIPES[recipe], **changes)
+    return replace(recipe, **changes)

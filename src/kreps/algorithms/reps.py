@@ -18,7 +18,7 @@ from kreps.dual import (
     standardise,
 )
 from kreps.embedding import KernelEmbedding, SampleModel, TransitionModel
-from kreps.errors import DataError
+from kreps.errors import ConfigurationError, DataError
 from kreps.hyperparameters import (
     EmbeddingLoss,
     PolicyLoss,
@@ -27,7 +27,7 @@ from kreps.hyperparameters import (
     minimise,
 )
 from kreps.kernels import Kernel, SquaredExponential, factors_of, median_lengthscales
-from kreps.policies import CostSensitiveGP
+from kreps.policies import MAX_SUPPORT, CostSensitiveGP
 from kreps.settings import Settings
 from kreps.value import Basis, RBFGrid, RKHSBasis, ValueFunction
 
@@ -76,7 +76,8 @@ class UpdateInfo:
         state_lengthscales: of V's kernel.
         embedding_parameters, policy_parameters: fitted values (not logs): lengthscales, then
             lambda, or sf2 and l.
-        jitter: largest jitter that any factorisation needed.
+        jitter: largest jitter that a factorisation of this update needed; trial points of the
+            hyper-parameter searches do not count.
         seconds: CPU seconds by stage.
     """
 
@@ -124,6 +125,11 @@ def update(
     if not window.rollouts:
         raise DataError("there is no roll-out to learn from; give at least one")
     data = window.transitions
+    if len(data) > MAX_SUPPORT:
+        raise ConfigurationError(
+            f"{len(data)} samples are kept, but the exact update takes at most {MAX_SUPPORT}, as "
+            f"it costs their cube; keep fewer than {len(window.rollouts)} roll-outs: lower window"
+        )
     clock = _Stopwatch()
 
     # Eq. 3: a basis of V, chosen among the sampled states

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+REFERENCE_RESTART_PROBABILITY = 0.02
+
 REFERENCE_REWARDS: dict[str, dict[str, float]] = {
     "kreps/SwingUp-v0": {
         "optimum (dynamic programming)": -21.2,

@@ -18,9 +18,6 @@ from kreps.progress import seconds_by_stage
 from kreps.storage import write_atomically
 from kreps.threads import blas_threads
 
-EVALUATION_EPISODES = 200
-EVALUATION_STEPS = 400
-
 
 @dataclass(frozen=True)
 class Cell:
@@ -72,8 +69,6 @@ def run_cell(cell: Cell) -> dict[str, Any]:
                     learner.task,
                     policy,
                     restart_probability=learner.settings.restart_probability,
-                    episodes=EVALUATION_EPISODES,
-                    steps=EVALUATION_STEPS,
                     seed=cell.seed,
                 )
             row[name] = found.mean

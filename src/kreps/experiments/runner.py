@@ -114,7 +114,7 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 def write_results(
     folder: Path, name: str, command: str, experiment: Experiment, rows: Sequence[dict[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """``NAME.csv`` with every row and ``NAME.json`` with summary, command, commit and versions."""
+    """``NAME.csv`` with every row, ``NAME.json`` with summary, command and commit, ``NAME.md``."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -131,6 +131,7 @@ def write_results(
         "summary": summary,
     }
     write_atomically(folder / f"{name}.json", (json.dumps(content, indent=2) + "\n").encode())
+    write_atomically(folder / f"{name}.md", (markdown_table(summary) + "\n").encode())
     return summary
 
 

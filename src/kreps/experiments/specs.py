@@ -37,7 +37,7 @@ EXPERIMENTS: dict[str, Experiment] = {
         iterations=20,
         methods={
             "kreps (default)": Method("default"),
-            "as in the paper": Method("paper"),
+            "paper-like": Method("paper"),
         },
     ),
 }
