@@ -19,7 +19,7 @@ import kreps
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import ConfigurationError, EnvironmentFailure, KrepsError
 from kreps.evaluation import EPISODES, STEPS
-from kreps.experiments.runner import cells_of, commit, run_cells, write_results
+from kreps.experiments.runner import cells_of, commits_of, rows_of, run_cells, write_results
 from kreps.experiments.specs import EXPERIMENTS
 from kreps.learner import KREPS
 from kreps.report import (
@@ -205,13 +205,13 @@ def reproduce(
         command += f" --iterations {iterations}"
     cells = cells_of(spec, trials, iterations)
     with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as executor:
-        rows = run_cells(cells, executor, out / "cells" / experiment)
-    summary = write_results(out, experiment, command, spec, rows)
+        results = run_cells(cells, executor, out / "cells" / experiment)
+    summary = write_results(out, experiment, command, spec, results)
     figure = plotting.comparison(
-        rows,
+        rows_of(results),
         REFERENCE_REWARDS.get(spec.environment, {}),
         f"{spec.environment}: every seed",
-        f"{command}   (commit {commit()})",
+        f"{command}   (commit {commits_of(results)})",
     )
     table = Table(title=f"{experiment}: average reward per step after the last update")
     for heading in ("method", "stochastic", "worst seed", "greedy", "worst seed"):

@@ -94,7 +94,8 @@ def read_cell(cell: Cell, folder: Path) -> dict[str, Any] | None:
     try:
         found = json.loads(path.read_text())
         same = found["cell"] == json.loads(json.dumps(cell.description()))
-        return found if same and len(found["rows"]) == cell.iterations else None
+        whole = len(found["rows"]) == cell.iterations and isinstance(found["commit"], str)
+        return found if same and whole else None
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -44,7 +44,7 @@ def cells_of(experiment: Experiment, trials: int, iterations: int | None) -> lis
 
 
 def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[dict[str, Any]]:
-    """Run what is not in the folder yet, keep each result as soon as it is there; rows of all."""
+    """The result of each cell; what is not in the folder yet is run, and kept when it is there."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -60,13 +60,14 @@ def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[d
         try:
             for future in as_completed(running):
                 cell = running[future]
-                results[cell.name] = future.result()
-                write_cell(cell, folder, future.result())
+                fresh = {"commit": commit(), **future.result()}
+                results[cell.name] = fresh
+                write_cell(cell, folder, fresh)
                 bar.update(task, advance=1)
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise
-    return [row for cell in cells for row in (results[cell.name] or {})["rows"]]
+    return [result for cell in cells if (result := results[cell.name]) is not None]
 
 
 def commit() -> str:
@@ -84,6 +85,16 @@ def commit() -> str:
         return git("rev-parse", "--short=12", "HEAD") + ("+" if changed else "")
     except (OSError, subprocess.SubprocessError):
         return "unknown"
+
+
+def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """One row per method, seed and iteration."""
+    return [row for result in results for row in result["rows"]]
+
+
+def commits_of(results: Sequence[Mapping[str, Any]]) -> str:
+    """The commits at which the cells were run: one, if all went well."""
+    return ", ".join(sorted({result["commit"] for result in results}))
 
 
 def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -112,9 +123,14 @@ def summarise(rows: Sequence[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 
 
 def write_results(
-    folder: Path, name: str, command: str, experiment: Experiment, rows: Sequence[dict[str, Any]]
+    folder: Path,
+    name: str,
+    command: str,
+    experiment: Experiment,
+    results: Sequence[Mapping[str, Any]],
 ) -> dict[str, dict[str, Any]]:
     """``NAME.csv`` with every row, ``NAME.json`` with summary, command and commit, ``NAME.md``."""
+    rows = rows_of(results)
     text = io.StringIO()
     writer = csv.DictWriter(text, list(rows[0]), lineterminator="\n")
     writer.writeheader()
@@ -125,7 +141,7 @@ def write_results(
     summary = summarise(rows)
     content = {
         "command": command,
-        "commit": commit(),
+        "commit": commits_of(results),
         "environment": experiment.environment,
         "versions": versions(),
         "summary": summary,
