@@ -11,6 +11,7 @@ import numpy as np
 
 from kreps.arrays import BoolArray, FloatArray, IntArray
 from kreps.errors import ConfigurationError, DataError
+from kreps.kernels import Factor, factors_of
 
 LARGEST = 1e100
 """Numbers beyond this are no data: their squares would overflow."""
@@ -29,12 +30,15 @@ class TaskSpec:
         observation_size: number of coordinates of an observation.
         action_low, action_high: (da,) finite limits of the actions, in the task's units.
         periodic: the observation coordinates that are angles in rad (period 2 pi).
+        groups: observation coordinates that share a lengthscale, such as the pixels of an image;
+            a coordinate in no group has its own.
     """
 
     observation_size: int
     action_low: FloatArray
     action_high: FloatArray
     periodic: tuple[int, ...] = ()
+    groups: tuple[tuple[int, ...], ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "action_low", np.array(self.action_low, np.float64, ndmin=1))
@@ -43,6 +47,8 @@ class TaskSpec:
             periodic = tuple(sorted({operator.index(i) for i in self.periodic}))
             object.__setattr__(self, "periodic", periodic)
             object.__setattr__(self, "observation_size", operator.index(self.observation_size))
+            groups = tuple(tuple(sorted({operator.index(i) for i in g})) for g in self.groups)
+            object.__setattr__(self, "groups", tuple(g for g in groups if g))
         except TypeError as error:
             raise ConfigurationError(
                 f"observation_size = {self.observation_size!r} and periodic = {self.periodic!r}, "
@@ -63,12 +69,26 @@ class TaskSpec:
                 f"action limits {low} to {high} must be finite and low < high; "
                 "the policy needs a scale for its actions, so give a bounded range"
             )
-        outside = [i for i in self.periodic if not 0 <= i < self.observation_size]
+        grouped = [i for group in self.groups for i in group]
+        if len(set(grouped)) < len(grouped):
+            raise ConfigurationError("a coordinate is in two groups; it has one lengthscale")
+        mixed = [g for g in self.groups if 0 < len(set(g) & set(self.periodic)) < len(g)]
+        if mixed:
+            raise ConfigurationError(
+                f"the group {mixed[0]} mixes angles and other coordinates, which share no scale"
+            )
+        named = (*self.periodic, *grouped)
+        outside = [i for i in named if not 0 <= i < self.observation_size]
         if outside:
             raise ConfigurationError(
-                f"periodic coordinates {outside} do not exist: observations have "
+                f"coordinates {outside} do not exist: observations have "
                 f"{self.observation_size} coordinates, numbered from 0"
             )
+
+    @property
+    def state_factors(self) -> tuple[Factor, ...]:
+        """The factors of a kernel over observations, each with one lengthscale."""
+        return factors_of(self.observation_size, self.periodic, self.groups)
 
     @property
     def action_size(self) -> int:

@@ -47,10 +47,19 @@ class Periodic:
         return np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
 
 
-def factors_of(dimension: int, periodic: Sequence[int] = ()) -> tuple[Factor, ...]:
-    """One factor per column: periodic where named, squared exponential elsewhere."""
+def factors_of(
+    dimension: int, periodic: Sequence[int] = (), groups: Sequence[Sequence[int]] = ()
+) -> tuple[Factor, ...]:
+    """One factor per group of columns, and one per column that is in no group.
+
+    Columns named in ``periodic`` are periodic, the others squared exponential.
+    """
+    grouped = {i for group in groups for i in group}
+    parts = [tuple(group) for group in groups]
+    parts += [(i,) for i in range(dimension) if i not in grouped]
     return tuple(
-        Periodic((i,)) if i in periodic else SquaredExponential((i,)) for i in range(dimension)
+        Periodic(dims) if set(dims) <= set(periodic) else SquaredExponential(dims)
+        for dims in sorted(parts)
     )
 
 

@@ -62,6 +62,7 @@ def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec
         action_low=actions.low.ravel(),
         action_high=actions.high.ravel(),
         periodic=tuple(periodic),
+        groups=tuple((env.metadata or {}).get("observation_groups", ())),
     )
 
 
@@ -157,17 +158,18 @@ def _simulate_batch(
     rewards = np.empty((longest, len(ends)))
     t = 0
     try:
-        observations[0] = _states(model.initial(rngs), len(ends), task)
+        states = model.initial(rngs)
+        observations[0] = _checked(model.observe(states), len(ends), task)
         for t in range(longest):
             live = np.flatnonzero(ends > t)
             if len(live) == 0:
                 break
             noise = np.array([noises[int(j)].standard_normal(task.action_size) for j in live])
             actions[t, live] = policy.act(observations[t, live], noise)
-            successors, rewards[t, live], done = model.step(
-                observations[t, live], task.clip(actions[t, live]), [rngs[int(j)] for j in live]
+            states[live], rewards[t, live], done = model.step(
+                states[live], task.clip(actions[t, live]), [rngs[int(j)] for j in live]
             )
-            observations[t + 1, live] = _states(successors, len(live), task)
+            observations[t + 1, live] = _checked(model.observe(states[live]), len(live), task)
             ends[live[done]] = t + 1
             terminated[live[done]] = True
     except DataError:
@@ -223,7 +225,7 @@ def _failure(error: Exception, where: str, steps: int) -> EnvironmentFailure:
     )
 
 
-def _states(observations: FloatArray, count: int, task: TaskSpec) -> FloatArray:
+def _checked(observations: FloatArray, count: int, task: TaskSpec) -> FloatArray:
     if np.shape(observations) != (count, task.observation_size):
         raise DataError(
             f"the batch model returned observations of shape {np.shape(observations)}, but "

@@ -22,7 +22,7 @@ from kreps.algorithms.reps import LearnerState
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Window, is_sane
 from kreps.errors import KrepsError, StorageError
-from kreps.kernels import Kernel, factors_of
+from kreps.kernels import Kernel
 from kreps.policies import CostSensitiveGP
 from kreps.settings import Settings
 from kreps.threads import blas_threads
@@ -180,6 +180,7 @@ def _task_header(task: TaskSpec) -> Header:
         "action_low": task.action_low.tolist(),
         "action_high": task.action_high.tolist(),
         "periodic": list(task.periodic),
+        "groups": [list(group) for group in task.groups],
     }
 
 
@@ -190,13 +191,14 @@ def _task_of(header: Header) -> TaskSpec:
         fields["action_low"],
         fields["action_high"],
         tuple(fields["periodic"]),
+        tuple(tuple(group) for group in fields["groups"]),
     )
 
 
 def _state_kernel(task: TaskSpec, lengthscales: FloatArray) -> Kernel:
     if not ((lengthscales > 1e-50) & (lengthscales < 1e50)).all():
         raise StorageError(f"lengthscales {lengthscales} are not all between 1e-50 and 1e50")
-    return Kernel(factors_of(task.observation_size, task.periodic), lengthscales)
+    return Kernel(task.state_factors, lengthscales)
 
 
 def _policy_parts(policy: CostSensitiveGP) -> Tensors:
@@ -219,7 +221,7 @@ def _policy_of(tensors: Tensors, task: TaskSpec) -> CostSensitiveGP:
             "policy.weights": ("m",),
             "policy.signal_and_noise": (2,),
         },
-        factors=task.observation_size,
+        factors=len(task.state_factors),
         ds=task.observation_size,
         da=task.action_size,
     )
@@ -254,7 +256,7 @@ def _value_of(tensors: Tensors, task: TaskSpec) -> ValueFunction:
             "value.centres": ("r", "ds"),
             "value.alpha": ("r",),
         },
-        factors=task.observation_size,
+        factors=len(task.state_factors),
         ds=task.observation_size,
     )
     kernel = _state_kernel(task, t["value.lengthscales"])
@@ -356,7 +358,7 @@ def load_checkpoint(path: str | Path) -> tuple[LearnerState, TaskSpec, Settings,
         if "window.lengths" in tensors:
             window = _window_of(tensors, task, settings.window)
         learnt = iteration > 0
-        g = task.observation_size
+        g = len(task.state_factors)
         state = LearnerState(
             window=window,
             iteration=iteration,

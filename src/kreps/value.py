@@ -109,10 +109,10 @@ class RBFGrid:
             ConfigurationError: more than `MAX_CENTRES` centres.
         """
         dimension = points.shape[1]
-        if size**dimension > MAX_CENTRES:
+        if size**dimension > MAX_CENTRES or len(factors) < dimension:
             raise ConfigurationError(
-                f"a grid of {size} centres in each of {dimension} coordinates has "
-                f"{float(size) ** dimension:.3g} centres, the limit is {MAX_CENTRES}; "
+                f"a grid of {size} centres in {dimension} coordinates has {size}^{dimension} "
+                f"centres, the limit is {MAX_CENTRES} (and no coordinate may share a lengthscale); "
                 'use features="rkhs", which needs no grid'
             )
         axes, lengthscales = [], []

@@ -26,7 +26,7 @@ from kreps.hyperparameters import (
     factor_distances,
     minimise,
 )
-from kreps.kernels import Kernel, SquaredExponential, factors_of, median_lengthscales
+from kreps.kernels import Kernel, SquaredExponential, median_lengthscales
 from kreps.policies import MAX_SUPPORT, CostSensitiveGP
 from kreps.settings import Settings
 from kreps.value import Basis, RBFGrid, RKHSBasis, ValueFunction
@@ -198,7 +198,7 @@ def update(
 
 def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) -> Kernel:
     """The kernel over states at the median lengthscales."""
-    factors = factors_of(task.observation_size, task.periodic)
+    factors = task.state_factors
     return Kernel(factors, median_lengthscales(factors, data.points, rng))
 
 

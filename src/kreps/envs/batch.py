@@ -15,15 +15,20 @@ class BatchModel(Protocol):
 
     An environment that offers one as its attribute ``batch_model`` is simulated in batches.  It
     must draw from the generators exactly what the environment draws from its own, so that both
-    forms give the same trajectories from the same seeds.
+    forms give the same trajectories from the same seeds.  States are the simulator's own; the
+    learner sees only what `observe` makes of them.
     """
 
     def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
-        """Start observations (m, ds)."""
+        """Start states (m, k)."""
+        ...
+
+    def observe(self, states: FloatArray) -> FloatArray:
+        """Observations (m, ds) of states (m, k)."""
         ...
 
     def step(
-        self, observations: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
+        self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Successors (m, ds), rewards (m,) and ends (m,) for actions (m, da)."""
+        """Successors (m, k), rewards (m,) and ends (m,) for actions (m, da)."""
         ...

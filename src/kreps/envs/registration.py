@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import gymnasium as gym
 
-ENVIRONMENTS = {"kreps/SwingUp-v0": "kreps.envs.swing_up:SwingUp"}
+ENVIRONMENTS = {
+    "kreps/SwingUp-v0": "kreps.envs.swing_up:SwingUp",
+    "kreps/Reaching-v0": "kreps.envs.reaching:Reaching",
+    "kreps/ImageSwingUp-v0": "kreps.envs.image_swing_up:ImageSwingUp",
+}
 
 
 def register() -> None:

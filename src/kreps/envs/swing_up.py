@@ -10,6 +10,7 @@ import numpy as np
 
 from kreps.arrays import BoolArray, FloatArray, as_float
 from kreps.envs.drawing import Canvas
+from kreps.envs.integration import runge_kutta
 
 MASS = 10.0  # kg
 LENGTH = 0.5  # m
@@ -37,17 +38,11 @@ def integrate(
     theta: FloatArray, velocity: FloatArray, torque: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Angle and velocity after one time step of constant torque (Runge-Kutta of order four)."""
-    h = TIME_STEP / SUB_STEPS
-    for _ in range(SUB_STEPS):
-        a1 = acceleration(theta, velocity, torque)
-        v2 = velocity + 0.5 * h * a1
-        a2 = acceleration(theta + 0.5 * h * velocity, v2, torque)
-        v3 = velocity + 0.5 * h * a2
-        a3 = acceleration(theta + 0.5 * h * v2, v3, torque)
-        v4 = velocity + h * a3
-        a4 = acceleration(theta + h * v3, v4, torque)
-        theta = theta + h / 6.0 * (velocity + 2.0 * v2 + 2.0 * v3 + v4)
-        velocity = velocity + h / 6.0 * (a1 + 2.0 * a2 + 2.0 * a3 + a4)
+
+    def derivative(state: FloatArray) -> FloatArray:
+        return np.stack([state[1], acceleration(state[0], state[1], torque)])
+
+    theta, velocity = runge_kutta(derivative, np.stack([theta, velocity]), TIME_STEP, SUB_STEPS)
     return theta, velocity
 
 
@@ -62,10 +57,13 @@ class SwingUpBatch:
     def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
         return np.tile([np.pi, 0.0], (len(rngs), 1))
 
+    def observe(self, states: FloatArray) -> FloatArray:
+        return states
+
     def step(
-        self, observations: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
+        self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        theta, velocity = observations.T
+        theta, velocity = states.T
         torque = np.clip(actions[:, 0], -MAX_TORQUE, MAX_TORQUE)
         noise = NOISE * np.array([rng.standard_normal() for rng in rngs])
         rewards = reward(theta, velocity, torque)

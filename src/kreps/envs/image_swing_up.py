@@ -1,0 +1,147 @@
+"""The swing-up seen through a camera (Sec. 4.5): 800 pixel values, no angle and no velocity."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from kreps.arrays import BoolArray, FloatArray, as_float
+from kreps.envs.swing_up import MAX_TORQUE, SwingUp, SwingUpBatch
+
+PIXELS = 20  # along each side
+EXTENT = 1.2  # m: the camera sees [-EXTENT, EXTENT]^2
+BLUR = 0.3  # m
+ROD = 1.0  # m, as it is drawn
+
+_AXIS = np.linspace(-EXTENT, EXTENT, PIXELS)
+_X, _Y = (a.ravel() for a in np.meshgrid(_AXIS, -_AXIS))
+
+
+def image(theta: FloatArray) -> FloatArray:
+    """Grey images (m, 400) of the rod at angles (m,): ``exp(-d^2 / (2 blur^2))`` at distance d."""
+    along_x, along_y = -np.sin(theta)[:, None], np.cos(theta)[:, None]
+    share = np.clip(_X * along_x + _Y * along_y, 0.0, ROD)
+    squares = (_X - share * along_x) ** 2 + (_Y - share * along_y) ** 2
+    return np.exp(-0.5 * squares / BLUR**2)
+
+
+class ImageSwingUpBatch:
+    """The swing-up for m roll-outs at once, observed as images.
+
+    States are angle, velocity and the angle one step earlier, which only the difference image
+    needs; they never leave this class.
+    """
+
+    _dynamics = SwingUpBatch()
+
+    def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
+        states = self._dynamics.initial(rngs)
+        return np.column_stack([states, states[:, 0]])
+
+    def observe(self, states: FloatArray) -> FloatArray:
+        now = image(states[:, 0])
+        return np.concatenate([now, now - image(states[:, 2])], axis=1)
+
+    def step(
+        self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
+    ) -> tuple[FloatArray, FloatArray, BoolArray]:
+        successors, rewards, done = self._dynamics.step(states[:, :2], actions, rngs)
+        return np.column_stack([successors, states[:, 0]]), rewards, done
+
+
+class ImageSwingUp(gym.Env[FloatArray, FloatArray]):
+    """
+    ## Description
+
+    The task of `kreps/SwingUp-v0`, seen only through a camera of 20 x 20 pixels: the observation is
+    the current image and its difference to the previous one, 800 numbers.  Dynamics, noise,
+    rewards and starting state are those of `kreps/SwingUp-v0`.
+
+    The camera looks at a field of [-1.2, 1.2]^2 m with a rod of length 1 m in it.  A pixel has the
+    value `exp(-d^2 / (2 * 0.3^2))`, where `d` is its distance to the rod.
+
+    ## Action Space
+
+    The action is a `ndarray` with shape `(1,)`; commands beyond the limits are clipped.
+
+    | Num | Action                   | Min   | Max  | Unit |
+    |-----|--------------------------|-------|------|------|
+    | 0   | Torque, counterclockwise | -30.0 | 30.0 | N m  |
+
+    ## Observation Space
+
+    The observation is a `ndarray` with shape `(800,)` and data type float64.
+    `metadata["observation_groups"]` tells that the pixels of each image belong together.
+
+    | Num     | Observation                                          | Min | Max |
+    |---------|------------------------------------------------------|-----|-----|
+    | 0-399   | Image, row by row from the top left                  | 0   | 1   |
+    | 400-799 | Image less the previous image, zero after a restart  | -1  | 1   |
+
+    ## Rewards
+
+    As in `kreps/SwingUp-v0`: `r = -10 theta^2 - 0.1 theta'^2 - 0.001 a^2`.
+
+    ## Starting State
+
+    Hanging at rest.
+
+    ## Episode End
+
+    The task never terminates and is never truncated.  The paper's protocol restarts it with
+    probability 0.02 per step: see `kreps.envs.RandomRestart`.
+
+    ## Arguments
+
+    `render_mode`: `None` or `"rgb_array"`.
+
+    ```python
+    >>> import gymnasium as gym
+    >>> import kreps
+    >>> env = gym.make("kreps/ImageSwingUp-v0", render_mode="rgb_array")
+
+    ```
+
+    ## Version History
+
+    * v0: Initial version.
+    """
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 (declared so by gymnasium.Env)
+        "render_modes": ["rgb_array"],
+        "render_fps": SwingUp.metadata["render_fps"],
+        "observation_groups": (tuple(range(PIXELS**2)), tuple(range(PIXELS**2, 2 * PIXELS**2))),
+        "action_labels": SwingUp.metadata["action_labels"],
+    }
+    batch_model = ImageSwingUpBatch()
+
+    def __init__(self, render_mode: str | None = None) -> None:
+        self.render_mode = render_mode
+        low = np.repeat([0.0, -1.0], PIXELS**2)
+        self.observation_space = gym.spaces.Box(low, np.ones(2 * PIXELS**2), dtype=np.float64)
+        self.action_space = gym.spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), dtype=np.float64)
+        self._state = np.empty((1, 3))
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._state = self.batch_model.initial([self.np_random])
+        return self.batch_model.observe(self._state)[0], {}
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        self._state, rewards, _ = self.batch_model.step(
+            self._state, as_float(action).reshape(1, 1), [self.np_random]
+        )
+        observation = self.batch_model.observe(self._state)[0]
+        return observation, float(rewards[0]), False, False, {}
+
+    def render(self) -> Any:
+        if self.render_mode != "rgb_array":
+            return None
+        grey = image(self._state[:, 0]).reshape(PIXELS, PIXELS)
+        pixels = np.round(255.0 * np.kron(grey, np.ones((12, 12)))).astype(np.uint8)
+        return np.repeat(pixels[..., None], 3, axis=2)
