@@ -434,6 +434,9 @@ class DoubleIntegrator(gym.Env[Any, Any]):
         self.action_space = gym.spaces.Box(-4.0, 4.0, (1,), np.float64)
         self.batch_model = self
 
+    def observe(self, states: FloatArray) -> FloatArray:
+        return states
+
     def initial(self, rngs: Any) -> FloatArray:
         return np.array([START + START_SPREAD * rng.standard_normal(2) for rng in rngs])
 

@@ -73,6 +73,9 @@ class ThreeSteps:
     def __init__(self, fault: str = "") -> None:
         self.fault = fault
 
+    def observe(self, states: FloatArray) -> FloatArray:
+        return states
+
     def initial(self, rngs: Any) -> FloatArray:
         return np.zeros((len(rngs), 3 if self.fault == "shape" else 2))
 
@@ -336,7 +339,7 @@ def test_periodic_coordinates_come_from_metadata_or_by_keyword() -> None:
     assert task_of(PointMass(periodic_coordinates=(1,)), [0]).periodic == (0,)
     assert task_of(PointMass(periodic_coordinates=(1,)), []).periodic == ()
     assert kreps.KREPS(PointMass(), periodic=[0, 1]).task.periodic == (0, 1)
-    with pytest.raises(ConfigurationError, match=r"periodic coordinates \[2\]"):
+    with pytest.raises(ConfigurationError, match=r"coordinates \[2\]"):
         kreps.KREPS(PointMass(), periodic=[2])
 
 

@@ -81,7 +81,7 @@ class TaskSpec:
         outside = [i for i in named if not 0 <= i < self.observation_size]
         if outside:
             raise ConfigurationError(
-                f"coordinates {outside} do not exist: observations have "
+                f"periodic or grouped coordinates {outside} do not exist: observations have "
                 f"{self.observation_size} coordinates, numbered from 0"
             )
 
