@@ -503,6 +503,7 @@ def _task(observation_size: Any = 2, **changes: Any) -> dict[str, Any]:
         "action_low": [-1.0],
         "action_high": [1.0],
         "periodic": [],
+        "groups": [],
     }
     return {**task, **changes}
 

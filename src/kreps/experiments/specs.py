@@ -40,4 +40,18 @@ EXPERIMENTS: dict[str, Experiment] = {
             "paper-like": Method("paper"),
         },
     ),
+    # the paper's first policy on this task, N(0, 0.5^2) N m, in units of half the range
+    "reaching": Experiment(
+        environment="kreps/Reaching-v0",
+        iterations=15,
+        methods={
+            "kreps (default)": Method(
+                "default", {"exploration": "gaussian", "exploration_scale": 0.05}
+            ),
+            "sample model": Method(
+                "default",
+                {"model": "sample", "exploration": "gaussian", "exploration_scale": 0.05},
+            ),
+        },
+    ),
 }

@@ -1,0 +1,91 @@
+"""The optimum of the reaching task by direct optimal control: what learners are measured against.
+
+    python benchmarks/reaching_optimum.py --steps 60 --starts 4
+
+The task is deterministic, so its optimum is one sequence of torques.  It is searched by L-BFGS-B
+over the first ``--steps`` periods (none are needed once the arm rests at the target), with
+central differences, from several random starts.  Writes ``results/reaching-optimum.json``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from kreps.arrays import FloatArray
+from kreps.envs.reaching import MAX_TORQUE, ReachingBatch
+from kreps.experiments.runner import commit
+from kreps.runs import versions
+
+RESTART = 0.02
+HORIZON = 250  # periods; beyond it lie 0.6 % of the weight
+DIFFERENCE = 1e-5  # N m
+
+
+def average_rewards(torques: FloatArray) -> FloatArray:
+    """Average reward (m,) of the restarting chain for torque sequences (m, steps, 2)."""
+    model, rngs = ReachingBatch(), [np.random.default_rng(0)] * len(torques)
+    states = model.initial(rngs)
+    total = np.zeros(len(torques))
+    weight, weights = 1.0, 0.0
+    for t in range(HORIZON):
+        a = torques[:, t] if t < torques.shape[1] else np.zeros((len(torques), 2))
+        states, rewards, _ = model.step(states, a, rngs)
+        total += weight * rewards
+        weights += weight
+        weight *= 1.0 - RESTART
+    return total / weights
+
+
+def loss_and_gradient(x: FloatArray, steps: int) -> tuple[float, FloatArray]:
+    shifts = DIFFERENCE * np.eye(len(x))
+    trials = np.concatenate([x[None], x + shifts, x - shifts]).reshape(-1, steps, 2)
+    values = -average_rewards(trials)
+    ahead, behind = values[1 : len(x) + 1], values[len(x) + 1 :]
+    return float(values[0]), (ahead - behind) / (2 * DIFFERENCE)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--starts", type=int, default=4)
+    parser.add_argument("--out", type=Path, default=Path("results"))
+    options = parser.parse_args()
+    rng = np.random.default_rng(0)
+    found: list[Any] = []
+    for start in range(options.starts):
+        result = minimize(
+            loss_and_gradient,
+            rng.normal(0.0, 1.0, 2 * options.steps),
+            args=(options.steps,),
+            jac=True,
+            method="L-BFGS-B",
+            bounds=[(-MAX_TORQUE, MAX_TORQUE)] * (2 * options.steps),
+            options={"maxiter": 400},
+        )
+        found.append(result)
+        print(f"start {start}: {-result.fun:.5f} after {result.nit} iterations", flush=True)
+    best = min(found, key=lambda result: result.fun)
+    content = {
+        "command": f"python benchmarks/reaching_optimum.py --steps {options.steps} "
+        f"--starts {options.starts}",
+        "commit": commit(),
+        "versions": versions(),
+        "average_reward": -float(best.fun),
+        "by_start": [-float(result.fun) for result in found],
+        "largest_torque": float(np.abs(best.x).max()),
+        "zero_torque": float(average_rewards(np.zeros((1, 1, 2)))[0]),
+    }
+    options.out.mkdir(parents=True, exist_ok=True)
+    path = options.out / "reaching-optimum.json"
+    path.write_text(json.dumps(content, indent=2) + "\n")
+    print(json.dumps(content, indent=2))
+
+
+if __name__ == "__main__":
+    main()
