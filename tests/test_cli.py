@@ -257,7 +257,7 @@ def test_an_empty_folder_may_be_used(tmp_path: Path) -> None:
         ([NAME, "--set", "periodic=0"], "periodic"),
         ([NAME, "--set", "env=1"], "env"),
         ([NAME, "--set", "threads=many"], "threads"),
-        ([NAME, "--periodic", "7"], "periodic coordinates [7]"),
+        ([NAME, "--periodic", "7"], "coordinates [7]"),
         ([NAME, "--iterations", "0"], "--iterations"),
         ([NAME, "--iterations", "many"], "--iterations"),
         ([NAME, "--seed", "-1"], "--seed"),

@@ -224,6 +224,7 @@ def test_groups_share_a_lengthscale_and_others_have_their_own() -> None:
         SquaredExponential((2, 4)),
         SquaredExponential((3,)),
     )
+    assert task.factor_count == 4
 
 
 @pytest.mark.parametrize(

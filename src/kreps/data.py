@@ -91,6 +91,11 @@ class TaskSpec:
         return factors_of(self.observation_size, self.periodic, self.groups)
 
     @property
+    def factor_count(self) -> int:
+        """How many lengthscales that are, counted without making them (a file may lie)."""
+        return self.observation_size - sum(len(group) - 1 for group in self.groups)
+
+    @property
     def action_size(self) -> int:
         return len(self.action_low)
 

@@ -221,7 +221,7 @@ def _policy_of(tensors: Tensors, task: TaskSpec) -> CostSensitiveGP:
             "policy.weights": ("m",),
             "policy.signal_and_noise": (2,),
         },
-        factors=len(task.state_factors),
+        factors=task.factor_count,
         ds=task.observation_size,
         da=task.action_size,
     )
@@ -256,7 +256,7 @@ def _value_of(tensors: Tensors, task: TaskSpec) -> ValueFunction:
             "value.centres": ("r", "ds"),
             "value.alpha": ("r",),
         },
-        factors=len(task.state_factors),
+        factors=task.factor_count,
         ds=task.observation_size,
     )
     kernel = _state_kernel(task, t["value.lengthscales"])
@@ -358,7 +358,7 @@ def load_checkpoint(path: str | Path) -> tuple[LearnerState, TaskSpec, Settings,
         if "window.lengths" in tensors:
             window = _window_of(tensors, task, settings.window)
         learnt = iteration > 0
-        g = len(task.state_factors)
+        g = task.factor_count
         state = LearnerState(
             window=window,
             iteration=iteration,
