@@ -31,7 +31,7 @@ format: .venv/installed
 
 constraints:                    ## renew constraints.txt (needs uv)
 	uv pip compile pyproject.toml --extra dev --universal --generate-hashes \
-	  --no-emit-index-url --no-annotate --no-header --upgrade --quiet -o constraints.txt
+	  --no-annotate --no-header --upgrade --quiet -o constraints.txt
 
 clean:
 	rm -rf .venv runs build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

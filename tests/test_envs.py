@@ -137,7 +137,7 @@ def test_the_picture_shows_upright_above_and_a_positive_angle_on_the_left() -> N
     def centre_of_rod(theta: float) -> FloatArray:
         env = SwingUp(render_mode="rgb_array")
         env.reset(seed=0)
-        env._observation = np.array([theta, 0.0])
+        env._states = np.array([[theta, 0.0]])
         picture = env.render().astype(int)
         rod = picture[..., 2] - picture[..., 0] > 60  # the rod is the only blue thing
         return np.argwhere(rod).mean(axis=0) - 119.5  # rows downwards, columns to the right

@@ -7,8 +7,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
-from kreps.arrays import BoolArray, FloatArray, as_float
+from kreps.arrays import BoolArray, FloatArray
+from kreps.envs.base import BatchEnvironment
 from kreps.envs.swing_up import MAX_TORQUE, SwingUp, SwingUpBatch
 
 PIXELS = 20  # along each side
@@ -52,7 +54,7 @@ class ImageSwingUpBatch:
         return np.column_stack([successors, states[:, 0]]), rewards, done
 
 
-class ImageSwingUp(gym.Env[FloatArray, FloatArray]):
+class ImageSwingUp(BatchEnvironment):
     """
     ## Description
 
@@ -119,29 +121,14 @@ class ImageSwingUp(gym.Env[FloatArray, FloatArray]):
     batch_model = ImageSwingUpBatch()
 
     def __init__(self, render_mode: str | None = None) -> None:
-        self.render_mode = render_mode
         low = np.repeat([0.0, -1.0], PIXELS**2)
-        self.observation_space = gym.spaces.Box(low, np.ones(2 * PIXELS**2), dtype=np.float64)
-        self.action_space = gym.spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), dtype=np.float64)
-        self._state = np.empty((1, 3))
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatArray, dict[str, Any]]:
-        super().reset(seed=seed)
-        self._state = self.batch_model.initial([self.np_random])
-        return self.batch_model.observe(self._state)[0], {}
-
-    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        self._state, rewards, _ = self.batch_model.step(
-            self._state, as_float(action).reshape(1, 1), [self.np_random]
+        super().__init__(
+            render_mode,
+            gym.spaces.Box(low, np.ones(2 * PIXELS**2), dtype=np.float64),
+            gym.spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), dtype=np.float64),
         )
-        observation = self.batch_model.observe(self._state)[0]
-        return observation, float(rewards[0]), False, False, {}
 
-    def render(self) -> Any:
-        if self.render_mode != "rgb_array":
-            return None
-        grey = image(self._state[:, 0]).reshape(PIXELS, PIXELS)
+    def picture(self, state: FloatArray) -> NDArray[np.uint8]:
+        grey = image(state[:1]).reshape(PIXELS, PIXELS)
         pixels = np.round(255.0 * np.kron(grey, np.ones((12, 12)))).astype(np.uint8)
         return np.repeat(pixels[..., None], 3, axis=2)

@@ -7,8 +7,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
-from kreps.arrays import BoolArray, FloatArray, as_float
+from kreps.arrays import BoolArray, FloatArray
+from kreps.envs.base import BatchEnvironment
 from kreps.envs.drawing import Canvas
 from kreps.envs.integration import runge_kutta
 
@@ -74,7 +76,7 @@ class ReachingBatch:
         return successors, reward(states, torques), np.zeros(len(rngs), dtype=bool)
 
 
-class Reaching(gym.Env[FloatArray, FloatArray]):
+class Reaching(BatchEnvironment):
     """
     ## Description
 
@@ -151,30 +153,15 @@ class Reaching(gym.Env[FloatArray, FloatArray]):
     batch_model = ReachingBatch()
 
     def __init__(self, render_mode: str | None = None) -> None:
-        self.render_mode = render_mode
         high = np.array([np.pi, np.pi, np.inf, np.inf])
-        self.observation_space = gym.spaces.Box(-high, high, dtype=np.float64)
-        self.action_space = gym.spaces.Box(-MAX_TORQUE, MAX_TORQUE, (2,), dtype=np.float64)
-        self._observation = np.array(START)
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatArray, dict[str, Any]]:
-        super().reset(seed=seed)
-        self._observation = self.batch_model.initial([self.np_random])[0]
-        return self._observation.copy(), {}
-
-    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        successors, rewards, _ = self.batch_model.step(
-            self._observation[None], as_float(action).reshape(1, 2), [self.np_random]
+        super().__init__(
+            render_mode,
+            gym.spaces.Box(-high, high, dtype=np.float64),
+            gym.spaces.Box(-MAX_TORQUE, MAX_TORQUE, (2,), dtype=np.float64),
         )
-        self._observation = successors[0]
-        return self._observation.copy(), float(rewards[0]), False, False, {}
 
-    def render(self) -> Any:
-        if self.render_mode != "rgb_array":
-            return None
-        upper, fore = self._observation[0], self._observation[0] + self._observation[1]
+    def picture(self, state: FloatArray) -> NDArray[np.uint8]:
+        upper, fore = state[0], state[0] + state[1]
         elbow = LINK * np.array([np.cos(upper), np.sin(upper)])
         tip = elbow + LINK * np.array([np.cos(fore), np.sin(fore)])
         canvas = Canvas(extent=1.25)

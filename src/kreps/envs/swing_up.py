@@ -7,8 +7,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from numpy.typing import NDArray
 
-from kreps.arrays import BoolArray, FloatArray, as_float
+from kreps.arrays import BoolArray, FloatArray
+from kreps.envs.base import BatchEnvironment
 from kreps.envs.drawing import Canvas
 from kreps.envs.integration import runge_kutta
 
@@ -72,7 +74,7 @@ class SwingUpBatch:
         return successors, rewards, np.zeros(len(rngs), dtype=bool)
 
 
-class SwingUp(gym.Env[FloatArray, FloatArray]):
+class SwingUp(BatchEnvironment):
     """
     ## Description
 
@@ -145,32 +147,15 @@ class SwingUp(gym.Env[FloatArray, FloatArray]):
     batch_model = SwingUpBatch()
 
     def __init__(self, render_mode: str | None = None) -> None:
-        self.render_mode = render_mode
-        high = np.array([1.5 * np.pi, np.inf])
-        low = np.array([-0.5 * np.pi, -np.inf])
-        self.observation_space = gym.spaces.Box(low, high, dtype=np.float64)
-        self.action_space = gym.spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), dtype=np.float64)
-        self._observation = np.array([np.pi, 0.0])
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[FloatArray, dict[str, Any]]:
-        super().reset(seed=seed)
-        self._observation = self.batch_model.initial([self.np_random])[0]
-        return self._observation.copy(), {}
-
-    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
-        successors, rewards, _ = self.batch_model.step(
-            self._observation[None], as_float(action).reshape(1, 1), [self.np_random]
+        low, high = np.array([-0.5 * np.pi, -np.inf]), np.array([1.5 * np.pi, np.inf])
+        super().__init__(
+            render_mode,
+            gym.spaces.Box(low, high, dtype=np.float64),
+            gym.spaces.Box(-MAX_TORQUE, MAX_TORQUE, (1,), dtype=np.float64),
         )
-        self._observation = successors[0]
-        return self._observation.copy(), float(rewards[0]), False, False, {}
 
-    def render(self) -> Any:
-        if self.render_mode != "rgb_array":
-            return None
-        theta = self._observation[0]
-        tip = np.array([-np.sin(theta), np.cos(theta)])
+    def picture(self, state: FloatArray) -> NDArray[np.uint8]:
+        tip = np.array([-np.sin(state[0]), np.cos(state[0])])
         canvas = Canvas(extent=1.25)
         canvas.disc((0.0, 0.0), 1.0, (0.95, 0.95, 0.96))
         canvas.rod((0.0, 0.0), tip, 0.09, (0.16, 0.38, 0.64))

@@ -1,0 +1,52 @@
+"""A Gymnasium environment made from a batch model: one row of it, one step at a time."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from kreps.arrays import FloatArray, as_float
+from kreps.envs.batch import BatchModel
+
+
+class BatchEnvironment(gym.Env[FloatArray, FloatArray]):
+    """Steps its class's ``batch_model``; a subclass adds the spaces and `picture`."""
+
+    batch_model: ClassVar[BatchModel]
+
+    def __init__(
+        self,
+        render_mode: str | None,
+        observation_space: gym.spaces.Space[Any],
+        action_space: gym.spaces.Space[Any],
+    ) -> None:
+        self.render_mode = render_mode
+        self.observation_space = observation_space
+        self.action_space = action_space
+        self._states = np.empty((0, 0))  # one row after the first reset
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self._states = self.batch_model.initial([self.np_random])
+        return self._observe(), {}
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        self._states, rewards, ends = self.batch_model.step(
+            self._states, as_float(action).reshape(1, -1), [self.np_random]
+        )
+        return self._observe(), float(rewards[0]), bool(ends[0]), False, {}
+
+    def render(self) -> Any:
+        return self.picture(self._states[0]) if self.render_mode == "rgb_array" else None
+
+    def picture(self, state: FloatArray) -> NDArray[np.uint8]:
+        """The picture (height, width, 3) of a state (k,)."""
+        raise NotImplementedError
+
+    def _observe(self) -> FloatArray:
+        return self.batch_model.observe(self._states)[0].copy()
