@@ -19,7 +19,15 @@ import kreps
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import ConfigurationError, EnvironmentFailure, KrepsError
 from kreps.evaluation import EPISODES, STEPS
-from kreps.experiments.runner import cells_of, commits_of, rows_of, run_cells, write_results
+from kreps.experiments.runner import (
+    TABLE_HEADINGS,
+    cells_of,
+    commits_of,
+    rows_of,
+    run_cells,
+    table_rows,
+    write_results,
+)
 from kreps.experiments.specs import EXPERIMENTS
 from kreps.learner import KREPS
 from kreps.report import (
@@ -214,18 +222,10 @@ def reproduce(
         f"{command}   (commit {commits_of(results)})",
     )
     table = Table(title=f"{experiment}: average reward per step after the last update")
-    for heading in ("method", "stochastic", "worst seed", "greedy", "worst seed"):
+    for heading in TABLE_HEADINGS:
         table.add_column(heading)
-    for method, entry in summary.items():
-        columns = [
-            text
-            for name in ("stochastic", "greedy")
-            for text in (
-                f"{entry[name]['mean']:.2f} ± {entry[name]['two_standard_errors']:.2f}",
-                f"{entry[name]['worst']:.2f}",
-            )
-        ]
-        table.add_row(method, *columns)
+    for row in table_rows(summary):
+        table.add_row(*row)
     console.print(table)
     say(f"Results:   {out / experiment}.csv, {out / experiment}.json")
     say(f"Figure:    {plotting.save(figure, out / f'{experiment}.png')}")

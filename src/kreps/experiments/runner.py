@@ -151,18 +151,30 @@ def write_results(
     return summary
 
 
-def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
-    """The summary as the documentation shows it."""
-    lines = [
-        "| method | stochastic policy | worst seed | greedy policy | worst seed | CPU s / update |",
-        "|---|---|---|---|---|---|",
-    ]
+TABLE_HEADINGS = ("method", "stochastic policy", "worst seed", "greedy policy", "worst seed")
+
+
+def table_rows(summary: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
+    """The summary in words: a row per method under `TABLE_HEADINGS`."""
+    largest = max(abs(entry["greedy"]["mean"]) for entry in summary.values())
+    places = 2 if largest >= 1.0 else 3
+    rows = []
     for method, entry in summary.items():
-        cells = [method]
+        row = [method]
         for name in ("stochastic", "greedy"):
-            found = entry[name]
-            cells.append(f"{found['mean']:.2f} ± {found['two_standard_errors']:.2f}")
-            cells.append(f"{found['worst']:.2f}")
-        cells.append(f"{entry['mean_update_cpu_seconds']:.2f}")
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join(lines)
+            mean, error = entry[name]["mean"], entry[name]["two_standard_errors"]
+            row.append(f"{mean:.{places}f} ± {error:.{places}f}")
+            row.append(f"{entry[name]['worst']:.{places}f}")
+        rows.append(row)
+    return rows
+
+
+def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
+    """The summary as the documentation shows it, with the CPU seconds of an update."""
+    headings = [*TABLE_HEADINGS, "CPU s / update"]
+    rows = [
+        [*row, f"{entry['mean_update_cpu_seconds']:.2f}"]
+        for row, entry in zip(table_rows(summary), summary.values(), strict=True)
+    ]
+    lines = [f"| {' | '.join(cells)} |" for cells in (headings, *rows)]
+    return "\n".join([lines[0], "|---" * len(headings) + "|", *lines[1:]])
