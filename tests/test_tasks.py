@@ -14,9 +14,12 @@ import kreps
 from kreps.arrays import FloatArray
 from kreps.envs import reaching
 from kreps.envs.image_swing_up import PIXELS, ImageSwingUpBatch, image
+from kreps.envs.references import REFERENCE_REWARDS
 from kreps.envs.swing_up import SwingUpBatch
 from kreps.errors import ConfigurationError
+from kreps.evaluation import evaluate
 from kreps.kernels import Periodic, SquaredExponential
+from kreps.policies import Gaussian
 from kreps.rollout import batch_model_of, simulate, task_of
 
 NAMES = ["kreps/Reaching-v0", "kreps/ImageSwingUp-v0"]
@@ -137,6 +140,14 @@ def test_angles_stay_inside_the_observation_space() -> None:
     for _ in range(100):
         observation, *_ = env.step(np.array([10.0, -10.0]))
         assert env.observation_space.contains(observation)
+
+
+def test_reference_value_of_random_torques() -> None:
+    env = gym.make("kreps/Reaching-v0")
+    task = task_of(env)
+    found = evaluate(env, task, Gaussian(task, 0.05), restart_probability=0.02, steps=300)
+    value = REFERENCE_REWARDS["kreps/Reaching-v0"]["random torques (0.5 N m)"]
+    assert found.mean == pytest.approx(value, abs=0.04)
 
 
 # ---- images -----------------------------------------------------------------------------------
