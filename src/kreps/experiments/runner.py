@@ -44,7 +44,10 @@ def cells_of(experiment: Experiment, trials: int, iterations: int | None) -> lis
 
 
 def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[dict[str, Any]]:
-    """The result of each cell; what is not in the folder yet is run, and kept when it is there."""
+    """The result of each cell; what is not in the folder yet is run, and kept when it is there.
+
+    A cell that fails does not keep the others from being run; its error is raised at the end.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -56,17 +59,24 @@ def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[d
     )
     with bar:
         task = bar.add_task("cells", total=len(cells), completed=len(cells) - len(left))
+        failures: list[Exception] = []
         running = {executor.submit(run_cell, cell): cell for cell in left}
         try:
             for future in as_completed(running):
                 cell = running[future]
-                fresh = {"commit": commit(), **future.result()}
+                try:
+                    fresh = {"commit": commit(), **future.result()}
+                except Exception as error:  # the other cells are worth having all the same
+                    failures.append(error)
+                    continue
                 results[cell.name] = fresh
                 write_cell(cell, folder, fresh)
                 bar.update(task, advance=1)
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise
+    if failures:
+        raise failures[0]
     return [result for cell in cells if (result := results[cell.name]) is not None]
 
 
