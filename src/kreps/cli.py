@@ -186,7 +186,7 @@ def video(
 @app.command(
     epilog="Examples:\n\n"
     "  kreps reproduce swing-up --trials 10 --workers 2\n\n"
-    "  kreps reproduce swing-up --trials 2 --iterations 5 --out /tmp/small"
+    "  kreps reproduce swing-up --trials 2 --iterations 5 --out small"
 )
 def reproduce(
     experiment: Annotated[str, typer.Argument(help=f"One of: {', '.join(EXPERIMENTS)}.")],

@@ -95,13 +95,15 @@ def learning_curve(
     return figure
 
 
-def draw_references(axes: Axes, references: Mapping[str, float]) -> None:
+def draw_references(axes: Axes, references: Mapping[str, float], *, named: bool = True) -> None:
     """A dashed line per value, named on the right; lower where the line above is too near."""
     spread = max(references.values(), default=0.0) - min(references.values(), default=0.0)
     above = np.inf
     for name, value in sorted(references.items(), key=lambda item: -item[1]):
         near = above - value < 0.05 * spread
         axes.axhline(value, color=GREY, lw=0.8, ls="--", zorder=0)
+        if not named:
+            continue
         axes.annotate(
             f"{name.replace(' (', chr(10) + '(')}  {value:g}",
             (1.0, value),
@@ -307,9 +309,7 @@ def comparison(
             mine = [row for row in rows if row["method"] == method]
             for axes, name in zip(plots[:, column], ("stochastic", "greedy"), strict=True):
                 _draw_seeds(axes, mine, name)
-                draw_references(axes, references if column == len(methods) - 1 else {})
-                for value in references.values():
-                    axes.axhline(value, color=GREY, lw=0.8, ls="--", zorder=0)
+                draw_references(axes, references, named=column == len(methods) - 1)
                 axes.set_title(f"{method}, {name} policy")
         for axes in plots[:, 0]:
             axes.set_ylabel("average reward per step")

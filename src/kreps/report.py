@@ -14,6 +14,7 @@ from rich.table import Table
 
 from kreps.controller import Policy
 from kreps.data import TaskSpec
+from kreps.dual import Outcome
 from kreps.envs.references import REFERENCE_RESTART_PROBABILITY, REFERENCE_REWARDS
 from kreps.errors import ConfigurationError, EnvironmentFailure
 from kreps.evaluation import EPISODES, STEPS, Evaluation, evaluate, stochastic_and_greedy
@@ -61,6 +62,11 @@ def report_run(folder: RunFolder, learner: KREPS) -> None:
         f"({state.steps} environment steps). The learnt policy earns {greedy:.4g} per step "
         f"without noise and {evaluation['stochastic'].mean:.4g} with it."
         + _in_words(_references(folder, learner), greedy)
+    )
+    last = folder.rows()[-1]
+    say(
+        f"Last update {Outcome[last['outcome']]} (KL {float(last['kl']):.3f} of at most "
+        f"{float(last['kl_bound']):g} nats, duality gap {float(last['gap']):.0e})."
     )
     say(f"Policy:    {folder.policy_file}  (kreps.load_policy reads it)")
     say(f"Numbers:   {folder.progress_file}, {folder.evaluation_file}")

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from kreps.dual import Outcome
 from kreps.errors import ConfigurationError, StorageError
 from kreps.learner import KREPS, IterationReport
 from kreps.progress import seconds_by_stage
@@ -153,6 +154,8 @@ class RunFolder:
                 if tuple(reader.fieldnames or ()) != COLUMNS:
                     raise ValueError("its columns are not those of a run")
                 for row in rows:
+                    if row["outcome"] not in Outcome.__members__:
+                        raise ValueError(f"it has an unknown outcome {row['outcome']!r:.40}")
                     if not all(
                         math.isfinite(float(row[name])) for name in COLUMNS if name != "outcome"
                     ):
