@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from kreps.algorithms import reps
+from kreps.algorithms import reps, transition_model
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
     LearnerState,
@@ -216,7 +216,8 @@ def test_fits_start_where_those_of_the_last_update_ended(monkeypatch: pytest.Mon
         starts.append(start)
         return minimise(loss, prior, start)
 
-    monkeypatch.setattr(reps, "minimise", spy)
+    for module in (reps, transition_model):
+        monkeypatch.setattr(module, "minimise", spy)
     first, _ = run(collect(seed=1))
     second, _ = run(collect(seed=2), state=first)
     assert len(starts) == 4  # embedding and policy, twice

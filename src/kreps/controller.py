@@ -11,7 +11,7 @@ from kreps import storage
 from kreps.arrays import FloatArray
 from kreps.data import LARGEST, is_sane
 from kreps.errors import DataError
-from kreps.policies import CostSensitiveGP
+from kreps.policies import LearntPolicy
 from kreps.seeding import Purpose, generator
 
 
@@ -19,11 +19,11 @@ class Policy:
     """A learnt stochastic policy, with Stable-Baselines3's signature of `predict`.
 
     Args:
-        process: the Gaussian process that it draws from.
+        process: what it draws from, for REPS a cost-sensitive Gaussian process.
         seed: of the exploration noise in `predict`.
     """
 
-    def __init__(self, process: CostSensitiveGP, seed: int = 0) -> None:
+    def __init__(self, process: LearntPolicy, seed: int = 0) -> None:
         self.process = process
         self._noise = generator(seed, Purpose.PREDICT)
 
@@ -39,7 +39,7 @@ class Policy:
         Args:
             observation: (ds,) or (m, ds).
             state, episode_start: accepted for compatibility; this policy has no memory.
-            deterministic: the mean of the policy instead of a draw from it.
+            deterministic: the policy without its exploration (the mean of a Gaussian process).
 
         Returns:
             Action (da,) or actions (m, da) in the task's units, and ``state`` as it came.
@@ -64,7 +64,7 @@ class Policy:
             )
         states = np.atleast_2d(batch)
         if deterministic:
-            commanded = self.process.mean(states)
+            commanded = self.process.greedy(states)
         else:
             noise = self._noise.standard_normal((len(states), task.action_size))
             commanded = self.process.act(states, noise)

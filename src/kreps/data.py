@@ -108,6 +108,14 @@ class TaskSpec:
         """Half the range (da,): actions in these units lie in [-1, 1] around the centre."""
         return 0.5 * (self.action_high - self.action_low)
 
+    def scaled(self, actions: FloatArray) -> FloatArray:
+        """Actions (m, da) around their centre, in units of the action scale."""
+        return (actions - self.action_centre) / self.action_scale
+
+    def unscaled(self, actions: FloatArray) -> FloatArray:
+        """Scaled actions (m, da) in the task's units."""
+        return self.action_centre + self.action_scale * actions
+
     def clip(self, actions: FloatArray) -> FloatArray:
         """The *applied* actions: what the actuators make of the commanded ones."""
         return np.clip(actions, self.action_low, self.action_high)

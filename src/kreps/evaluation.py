@@ -13,7 +13,7 @@ import numpy as np
 
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec
-from kreps.policies import CostSensitiveGP, StochasticPolicy
+from kreps.policies import LearntPolicy, StochasticPolicy
 from kreps.rollout import Environment, simulate, without_restarts
 from kreps.seeding import Purpose, generator, integer_seed
 
@@ -24,12 +24,12 @@ STEPS = 400
 
 @dataclass(frozen=True)
 class Greedy:
-    """The mean of a policy as a policy of its own."""
+    """A policy without its exploration, as a policy of its own."""
 
-    policy: CostSensitiveGP
+    policy: LearntPolicy
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
-        return self.policy.mean(states)
+        return self.policy.greedy(states)
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ def discounted_average(rollouts: Sequence[Rollout], restart_probability: float) 
     return Evaluation(mean, error, count, max(len(rollout) for rollout in rollouts))
 
 
-def stochastic_and_greedy(policy: CostSensitiveGP) -> dict[str, StochasticPolicy]:
+def stochastic_and_greedy(policy: LearntPolicy) -> dict[str, StochasticPolicy]:
     """The two ways in which every learnt policy is judged, by name."""
     return {"stochastic": policy, "greedy": Greedy(policy)}
 

@@ -21,6 +21,11 @@ from kreps.arrays import FloatArray
 class Factor(Protocol):
     """One factor of a product kernel, with one lengthscale."""
 
+    @property
+    def dims(self) -> tuple[int, ...]:
+        """The columns of the input that it sees."""
+        ...
+
     def coordinates(self, x: FloatArray) -> FloatArray:
         """Euclidean coordinates (n, m) of inputs (n, d) at lengthscale one."""
         ...

@@ -1,26 +1,39 @@
-"""KREPS: the facade.  Collect roll-outs, update, report, and do it again."""
+"""The facade: collect roll-outs, update, report, and do it again.
+
+`Learner` is the surface; `KREPS` and the comparative methods of Sec. 4.2 say how they update.
+"""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from numbers import Integral
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 
 from kreps import storage
-from kreps.algorithms.reps import LearnerState, UpdateInfo, update
+from kreps.algorithms import npalp, reps, value_iteration
+from kreps.algorithms.state import LearnerState, UpdateReport
 from kreps.arrays import FloatArray
 from kreps.controller import Policy
 from kreps.data import Rollout, TaskSpec, Window
 from kreps.errors import ConfigurationError, DataError
 from kreps.policies import BangBang, Gaussian, StochasticPolicy
-from kreps.rollout import Environment, collect, task_of, without_restarts
+from kreps.rollout import Environment, collect, collect_grid, task_of, without_restarts
 from kreps.seeding import Purpose, generator
-from kreps.settings import Settings, settings_of
+from kreps.settings import (
+    GridValueIterationSettings,
+    LearnerSettings,
+    NPALPSettings,
+    OnPolicySettings,
+    Settings,
+    ValueIterationSettings,
+    changed,
+    settings_of,
+)
 from kreps.threads import blas_threads
 from kreps.value import ValueFunction
 
@@ -39,7 +52,7 @@ class IterationReport:
         iteration: updates made, this one included.
         rollouts, steps: roll-outs and environment steps seen so far.
         average_reward: per step, over the new roll-outs.
-        update: what the update reports, with CPU seconds by stage.
+        update: what the method reports of the update, with CPU seconds by stage.
         rollout_seconds: CPU seconds that the new roll-outs took.
     """
 
@@ -47,40 +60,49 @@ class IterationReport:
     rollouts: int
     steps: int
     average_reward: float
-    update: UpdateInfo
+    update: Any
     rollout_seconds: float
 
 
-Callback = Callable[["KREPS", IterationReport], bool | None]
-"""Called after each iteration; returning False ends the learning early."""
+Callback = Callable[[Any, IterationReport], bool | None]
+"""Called with learner and report after each iteration; returning False ends the learning early."""
+
+MethodSettings = TypeVar("MethodSettings", bound=LearnerSettings)
+OnPolicy = TypeVar("OnPolicy", bound=OnPolicySettings)
 
 
-class KREPS:
-    """Relative entropy policy search with RKHS embeddings.
+class Learner(Generic[MethodSettings]):
+    """What every method offers: `learn`, `update`, `predict`, `save`, `resume`.
 
     Args:
         env: a Gymnasium environment with Box observations and bounded Box actions, or a
             `TaskSpec` if all data comes through `update`.  The learner restarts it at random as
             in the paper (Sec. 4.1), so it need not end by itself.
         seed: of everything random; the same seed gives the same policy, byte for byte.
-        recipe: ``"default"``, ``"paper"`` (close to the printed method) or a `kreps.Settings`.
         periodic: coordinates of the observation that are angles in rad; None asks the
             environment's ``metadata["periodic_coordinates"]``.
         threads: BLAS threads while learning; None leaves BLAS as it is.  Another number may
             change the last bits of a policy.
-        **settings: any field of `kreps.Settings`, such as ``kl_bound``.
+        **settings: any field of the method's ``settings_type``.
 
     Raises:
         SpaceError: the environment's spaces cannot be served.
         ConfigurationError: unknown or impossible settings.
     """
 
+    method: ClassVar[str]
+    """Its name in files."""
+
+    settings_type: ClassVar[type[Any]]
+
+    algorithm: ClassVar[Callable[..., tuple[LearnerState, UpdateReport]]]
+    """One update: ``(state, rollouts, task, settings, rng) -> (state, report)``."""
+
     def __init__(
         self,
         env: Environment | TaskSpec,
         *,
         seed: int = 0,
-        recipe: str | Settings = "default",
         periodic: Sequence[int] | None = None,
         threads: int | None = 1,
         **settings: Any,
@@ -104,16 +126,19 @@ class KREPS:
                         f"restart_probability = {asked!r}, but the environment's RandomRestart has "
                         f"{probability!r}; give one of them"
                     )
-        self.settings: Settings = settings_of(recipe, **settings)
+        self.settings = self._settings(settings)
         self.threads = None if threads is None else max(1, _whole("threads", threads))
         self.state = LearnerState(Window(self.settings.window))
         self._policy: Policy | None = None
 
+    def _settings(self, changes: dict[str, Any]) -> MethodSettings:
+        return changed(self.settings_type(), changes)
+
     def __repr__(self) -> str:
         state = self.state
         return (
-            f"<KREPS seed {self.seed}: {state.iteration} updates from {state.rollouts} roll-outs "
-            f"({state.steps} steps)>"
+            f"<{type(self).__name__} seed {self.seed}: {state.iteration} updates from "
+            f"{state.rollouts} roll-outs ({state.steps} steps)>"
         )
 
     @property
@@ -131,24 +156,13 @@ class KREPS:
             self._policy = Policy(self.state.policy, self.seed)
         return self._policy
 
-    @property
-    def value_function(self) -> ValueFunction:
-        """V of the last update (Eq. 3), in units of the reward.
-
-        Raises:
-            ConfigurationError: nothing has been learnt yet.
-        """
-        if self.state.value is None:
-            raise ConfigurationError("no V has been learnt yet; call learn() or update() first")
-        return self.state.value
-
     def learn(
         self,
         iterations: int = 20,
         *,
         callback: Callback | Sequence[Callback] = (),
         progress: bool = True,
-    ) -> KREPS:
+    ) -> Self:
         """Make ``iterations`` more updates, each from new roll-outs of the current policy.
 
         Args:
@@ -171,7 +185,7 @@ class KREPS:
         if progress:
             from kreps.progress import ProgressTable
 
-            with ProgressTable(self.settings, self.state.iteration + iterations) as table:
+            with ProgressTable(self.state.iteration + iterations) as table:
                 return self._learn(iterations, [*callbacks, table], table.rollouts_done)
         return self._learn(iterations, callbacks, None)
 
@@ -180,25 +194,12 @@ class KREPS:
         iterations: int,
         callbacks: Sequence[Callback],
         on_rollout: Callable[[int], None] | None,
-    ) -> KREPS:
+    ) -> Self:
         assert self.env is not None
         for _ in range(iterations):
-            first = self.state.iteration == 0
-            count = (
-                self.settings.initial_rollouts if first else self.settings.rollouts_per_iteration
-            )
             started = time.process_time()
             with blas_threads(self.threads):
-                rollouts = collect(
-                    self.env,
-                    self.task,
-                    self._acting_policy(),
-                    count,
-                    seed=self.seed,
-                    iteration=self.state.iteration,
-                    restart_probability=self.settings.restart_probability,
-                    on_rollout=on_rollout,
-                )
+                rollouts = self._collect(self.env, on_rollout)
             seconds = time.process_time() - started
             info = self.update(rollouts)
             report = IterationReport(
@@ -213,7 +214,7 @@ class KREPS:
                 break
         return self
 
-    def update(self, rollouts: Iterable[Rollout]) -> UpdateInfo:
+    def update(self, rollouts: Iterable[Rollout]) -> UpdateReport:
         """One update from roll-outs collected anywhere; those kept from before count too.
 
         Args:
@@ -235,15 +236,14 @@ class KREPS:
             raise DataError("there is no new roll-out to learn from; give at least one")
         rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
         with blas_threads(self.threads):
-            self.state, info = update(self.state, rollouts, self.task, self.settings, rng)
+            self.state, info = type(self).algorithm(
+                self.state, rollouts, self.task, self.settings, rng
+            )
         return info
 
-    def _acting_policy(self) -> StochasticPolicy:
-        if self.state.policy is not None:
-            return self.state.policy
-        if self.settings.exploration == "bang-bang":
-            return BangBang(self.task)
-        return Gaussian(self.task, self.settings.exploration_scale)
+    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
+        """The next iteration's data."""
+        raise NotImplementedError
 
     def predict(
         self,
@@ -252,15 +252,15 @@ class KREPS:
         episode_start: Any = None,
         deterministic: bool = False,
     ) -> tuple[FloatArray, Any]:
-        """`Policy.predict` of the current policy."""
+        """`kreps.Policy.predict` of the current policy."""
         return self.policy.predict(observation, state, episode_start, deterministic)
 
     def save(self, path: str | Path) -> None:
         """Write a checkpoint from which `resume` goes on as if nothing had happened."""
-        storage.save_checkpoint(path, self.state, self.task, self.settings, self.seed)
+        storage.save_checkpoint(path, self.method, self.state, self.task, self.settings, self.seed)
 
     @classmethod
-    def resume(cls, path: str | Path, env: Environment | None = None) -> KREPS:
+    def resume(cls, path: str | Path, env: Environment | None = None) -> Self:
         """A learner as it was when it was saved; settings and seed come from the file.
 
         Args:
@@ -271,8 +271,8 @@ class KREPS:
             StorageError: the file is missing, damaged or foreign.
             ConfigurationError: the environment is not of the shape that was learnt in.
         """
-        state, task, settings, seed = storage.load_checkpoint(path)
-        learner = cls(task, seed=seed)
+        state, task, settings, seed = storage.load_checkpoint(path, cls.method, cls.settings_type)
+        learner = cls(task, seed=seed, **asdict(settings))
         if env is not None:
             learner.env, _ = without_restarts(env)
             found = task_of(env, task.periodic)
@@ -287,5 +287,138 @@ class KREPS:
                     f"{task.observation_size} and {task.action_low} to {task.action_high}; "
                     "resume in the environment that it was learnt in"
                 )
-        learner.settings, learner.state = settings, state
+        learner.state = state
         return learner
+
+
+class OnPolicyLearner(Learner[OnPolicy]):
+    """A learner that explores by its own stochastic policy, from start states only (Sec. 4.1)."""
+
+    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
+        first = self.state.iteration == 0
+        settings = self.settings
+        return collect(
+            env,
+            self.task,
+            self._acting_policy(),
+            settings.initial_rollouts if first else settings.rollouts_per_iteration,
+            seed=self.seed,
+            iteration=self.state.iteration,
+            restart_probability=settings.restart_probability,
+            on_rollout=on_rollout,
+        )
+
+    def _acting_policy(self) -> StochasticPolicy:
+        if self.state.policy is not None:
+            return self.state.policy
+        if self.settings.exploration == "bang-bang":
+            return BangBang(self.task)
+        return Gaussian(self.task, self.settings.exploration_scale)
+
+
+class KREPS(OnPolicyLearner[Settings]):
+    """Relative entropy policy search with RKHS embeddings.
+
+    Args:
+        env, seed, periodic, threads: as of `Learner`.
+        recipe: ``"default"``, ``"paper"`` (close to the printed method) or a `kreps.Settings`.
+        **settings: any field of `kreps.Settings`, such as ``kl_bound``.
+
+    Raises:
+        SpaceError: the environment's spaces cannot be served.
+        ConfigurationError: unknown or impossible settings.
+    """
+
+    method = "reps"
+    settings_type = Settings
+    algorithm = staticmethod(reps.update)
+
+    def __init__(
+        self,
+        env: Environment | TaskSpec,
+        *,
+        seed: int = 0,
+        recipe: str | Settings = "default",
+        periodic: Sequence[int] | None = None,
+        threads: int | None = 1,
+        **settings: Any,
+    ) -> None:
+        self._recipe = recipe
+        super().__init__(env, seed=seed, periodic=periodic, threads=threads, **settings)
+
+    def _settings(self, changes: dict[str, Any]) -> Settings:
+        return settings_of(self._recipe, **changes)
+
+    @property
+    def value_function(self) -> ValueFunction:
+        """V of the last update (Eq. 3), in units of the reward.
+
+        Raises:
+            ConfigurationError: nothing has been learnt yet.
+        """
+        if self.state.value is None:
+            raise ConfigurationError("no V has been learnt yet; call learn() or update() first")
+        return self.state.value
+
+
+class ValueIteration(OnPolicyLearner[ValueIterationSettings]):
+    """Value iteration with RKHS embeddings, exploring by softmax (Gruenewaelder et al. 2012).
+
+    Arguments and errors are those of `Learner`; settings `kreps.settings.ValueIterationSettings`.
+    """
+
+    method = "value-iteration"
+    settings_type = ValueIterationSettings
+    algorithm = staticmethod(value_iteration.update)
+
+
+class GridValueIteration(Learner[GridValueIterationSettings]):
+    """Off-policy value iteration with RKHS embeddings on a grid of states and actions.
+
+    It is given what no robot offers: a simulator that can be set to any state.  Its environment
+    needs a ``batch_model`` with ``states_at`` (see `kreps.envs.batch.SettableModel`), as
+    `kreps/SwingUp-v0` and `kreps/Reaching-v0` have it.  Each iteration tries one step from every
+    grid point; one iteration is enough.
+
+    Arguments and errors are those of `Learner`; settings
+    `kreps.settings.GridValueIterationSettings`.
+    """
+
+    method = "grid-value-iteration"
+    settings_type = GridValueIterationSettings
+    algorithm = staticmethod(value_iteration.update)
+
+    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
+        settings = self.settings
+        rollouts = collect_grid(
+            env,
+            self.task,
+            settings.ranges,
+            settings.grid_states,
+            settings.grid_actions,
+            most=settings.window,
+            seed=self.seed,
+            iteration=self.state.iteration,
+        )
+        if on_rollout is not None:
+            on_rollout(len(rollouts))
+        return rollouts
+
+
+class NPALP(OnPolicyLearner[NPALPSettings]):
+    """Non-parametric approximate linear programming (Pazis and Parr 2011).
+
+    For deterministic tasks only: it takes the best that was seen to happen for what will happen.
+
+    Arguments and errors are those of `Learner`; settings `kreps.settings.NPALPSettings`.
+    """
+
+    method = "npalp"
+    settings_type = NPALPSettings
+    algorithm = staticmethod(npalp.update)
+
+
+LEARNERS: dict[str, type[Learner[Any]]] = {
+    learner.method: learner for learner in (KREPS, ValueIteration, GridValueIteration, NPALP)
+}
+"""By name in files."""

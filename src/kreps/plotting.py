@@ -13,10 +13,11 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from kreps.algorithms.reps import LearnerState
+from kreps.algorithms.state import LearnerState
 from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
 from kreps.errors import ConfigurationError, StorageError
+from kreps.policies import CostSensitiveGP
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -127,7 +128,7 @@ def policy_maps(
     Raises:
         ConfigurationError: the state space has not two dimensions.
     """
-    assert state.policy is not None and state.value is not None
+    assert isinstance(state.policy, CostSensitiveGP) and state.value is not None
     axes_x, axes_y, states = _grid(state, task)
     low, high = task.action_low[0], task.action_high[0]
     spread = state.policy.standard_deviation(states)[:, 0]
@@ -192,7 +193,7 @@ def film(
             x, y, states = _grid(state, task)
             assert state.policy is not None
             low, high = task.action_low[0], task.action_high[0]
-            mean = np.clip(state.policy.mean(states)[:, 0], low, high)
+            mean = np.clip(state.policy.greedy(states)[:, 0], low, high)
             axes.contourf(
                 x, y, mean.reshape(len(y), len(x)), np.linspace(low, high, 12), cmap="RdBu_r"
             )

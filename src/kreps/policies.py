@@ -31,6 +31,17 @@ class StochasticPolicy(Protocol):
         ...
 
 
+class LearntPolicy(StochasticPolicy, Protocol):
+    """A policy that can also be followed without its exploration."""
+
+    @property
+    def task(self) -> TaskSpec: ...
+
+    def greedy(self, states: FloatArray) -> FloatArray:
+        """Actions (m, da) at states (m, ds) without exploration, in the task's units."""
+        ...
+
+
 @dataclass(frozen=True)
 class BangBang:
     """Each action at one of its limits, with random sign: what bounded control often is."""
@@ -117,7 +128,10 @@ class CostSensitiveGP:
 
     def mean(self, states: FloatArray) -> FloatArray:
         """Mean action (m, da) at states (m, ds), in the task's units, not clipped."""
-        return self._actions(self.predictor.mean(self.predictor.covariances(states)))
+        return self.task.unscaled(self.predictor.mean(self.predictor.covariances(states)))
+
+    def greedy(self, states: FloatArray) -> FloatArray:
+        return self.mean(states)
 
     def standard_deviation(self, states: FloatArray) -> FloatArray:
         """Standard deviation (m, da) of the commanded action, in the task's units."""
@@ -127,10 +141,7 @@ class CostSensitiveGP:
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
         k = self.predictor.covariances(states)
         spread = self.predictor.standard_deviation(k)
-        return self._actions(self.predictor.mean(k) + spread[:, None] * noise)
-
-    def _actions(self, scaled: FloatArray) -> FloatArray:
-        return self.task.action_centre + self.task.action_scale * scaled
+        return self.task.unscaled(self.predictor.mean(k) + spread[:, None] * noise)
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.live import Live
@@ -16,13 +16,9 @@ from rich.progress import (
 )
 from rich.table import Table
 
-from kreps.dual import Outcome
-from kreps.settings import Settings
-
 if TYPE_CHECKING:
-    from kreps.learner import KREPS, IterationReport
+    from kreps.learner import IterationReport, Learner
 
-COLUMNS = ("iter", "steps", "reward", "KL / bound", "eta", "ESS", "gap", "CPU s", "note")
 SHOWN_ROWS = 24
 
 
@@ -31,25 +27,12 @@ def seconds_by_stage(report: IterationReport) -> dict[str, float]:
     return {"rollouts": report.rollout_seconds, **report.update.seconds}
 
 
-def note_of(report: IterationReport) -> str:
-    """What is out of the ordinary about an update, in a few words."""
-    notes = {
-        Outcome.AT_FLOOR: "eta at its floor",
-        Outcome.FALLBACK: "by bisection",
-        Outcome.NOT_CONVERGED: "NOT CONVERGED",
-    }
-    note = notes.get(report.update.dual.outcome, "")
-    jitter = report.update.jitter
-    return f"{note}  jitter {jitter:.0e}".strip() if jitter else note
-
-
 class ProgressTable:
     """A callback that shows each iteration as a row, and the time that is left."""
 
-    def __init__(self, settings: Settings, target: int) -> None:
-        self._settings = settings
+    def __init__(self, target: int) -> None:
         self._console = Console()
-        self._rows: list[tuple[str, ...]] = []
+        self._rows: list[dict[str, str]] = []
         self._stages: dict[str, float] = {}
         self._bar = Progress(
             TextColumn("learning"),
@@ -83,36 +66,34 @@ class ProgressTable:
     def rollouts_done(self, count: int) -> None:
         self._bar.update(self._task, note=f"{count} roll-outs")
 
-    def __call__(self, learner: KREPS, report: IterationReport) -> None:
-        dual = report.update.dual
+    def __call__(self, learner: Learner[Any], report: IterationReport) -> None:
         stages = seconds_by_stage(report)
         for name, seconds in stages.items():
             self._stages[name] = self._stages.get(name, 0.0) + seconds
-        row = (
-            f"{report.iteration}",
-            f"{report.steps}",
-            f"{report.average_reward:.4g}",
-            f"{dual.kl:.3f} / {self._settings.kl_bound:g}",
-            f"{dual.eta:.3g}",
-            f"{report.update.effective_samples:.0f}",
-            f"{dual.gap:.0e}",
-            f"{sum(stages.values()):.2f}",
-            note_of(report),
-        )
+        shown = report.update.shown()
+        note = shown.pop("note", "")
+        row = {
+            "iter": f"{report.iteration}",
+            "steps": f"{report.steps}",
+            "reward": f"{report.average_reward:.4g}",
+            **shown,
+            "CPU s": f"{sum(stages.values()):.2f}",
+            "note": note,
+        }
         if self._console.is_terminal:
             self._rows.append(row)
             self._bar.update(self._task, completed=report.iteration)
             self._live.update(self._layout())
         else:
-            pairs = zip(COLUMNS, row, strict=True)
-            print("  ".join(f"{name} {value}" for name, value in pairs if value), flush=True)
+            shown = [f"{name} {value}" for name, value in row.items() if value]
+            print("  ".join(shown), flush=True)
 
     def _layout(self) -> Table:
         table = Table(box=None, pad_edge=False)
-        for name in COLUMNS:
+        for name in self._rows[-1] if self._rows else ():
             table.add_column(name, justify="left" if name == "note" else "right")
         for row in self._rows[-SHOWN_ROWS:]:
-            table.add_row(*row)
+            table.add_row(*row.values())
         whole = Table.grid()
         whole.add_row(table)
         if self._stages:

@@ -13,7 +13,7 @@ import numpy as np
 
 from kreps.arrays import FloatArray
 from kreps.data import LARGEST, Rollout, TaskSpec, is_sane
-from kreps.envs.batch import BatchModel
+from kreps.envs.batch import BatchModel, SettableModel
 from kreps.envs.restart import RandomRestart, restart_length
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
 from kreps.policies import StochasticPolicy
@@ -115,6 +115,88 @@ def collect(
     noises = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
     lengths = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
     return simulate(env, task, policy, seeds, noises, lengths, on_rollout)
+
+
+def collect_grid(
+    env: Environment,
+    task: TaskSpec,
+    ranges: Sequence[tuple[float, float]] | None,
+    grid_states: int,
+    grid_actions: int,
+    *,
+    most: int,
+    seed: int,
+    iteration: int,
+) -> list[Rollout]:
+    """One step from every point of a grid over states and actions: roll-outs of one step.
+
+    Args:
+        env: its batch model is a `kreps.envs.batch.SettableModel`.
+        ranges: least and largest value of each coordinate; None asks the observation space.
+        grid_states, grid_actions: points per coordinate.  Angles are spaced over a whole turn.
+        most: grid points that may be asked for.
+
+    Raises:
+        ConfigurationError: the environment cannot be set to a state, or there are too many points.
+        SpaceError: a coordinate has no limits.
+    """
+    model = batch_model_of(env)
+    if model is None or not hasattr(model, "states_at"):
+        raise ConfigurationError(
+            f"{env} cannot be set to any state, which a grid of states needs: its batch_model "
+            "would have states_at(observations); use kreps.ValueIteration, which explores by itself"
+        )
+    count = grid_states**task.observation_size * grid_actions**task.action_size
+    if count > most:
+        raise ConfigurationError(
+            f"a grid of {grid_states} points in each of {task.observation_size} state and "
+            f"{grid_actions} in each of {task.action_size} action coordinates has {count} points, "
+            f"the limit is {most}; lower grid_states or grid_actions, or raise window"
+        )
+    axes = [
+        np.arange(grid_states) * 2.0 * np.pi / grid_states
+        if i in task.periodic
+        else np.linspace(*limits, grid_states)
+        for i, limits in enumerate(_limits(env, task, ranges))
+    ]
+    axes += [
+        np.linspace(low, high, grid_actions)
+        for low, high in zip(task.action_low, task.action_high, strict=True)
+    ]
+    grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
+    states, actions = np.split(grid, [task.observation_size], axis=1)
+    rngs = [generator(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
+    simulated = cast(SettableModel, model).states_at(states)
+    observations = _checked(model.observe(simulated), count, task).copy()
+    simulated, rewards, ended = model.step(simulated, actions, rngs)
+    successors = _checked(model.observe(simulated), count, task)
+    return [
+        Rollout(np.stack([before, after]), action[None], np.array([reward]), bool(end))
+        for before, after, action, reward, end in zip(
+            observations, successors, actions, rewards, ended, strict=True
+        )
+    ]
+
+
+def _limits(
+    env: Environment, task: TaskSpec, ranges: Sequence[tuple[float, float]] | None
+) -> list[tuple[float, float]]:
+    """Finite limits of each observation coordinate that is no angle."""
+    if ranges is None:
+        space = cast(gym.spaces.Box, env.observation_space)
+        ranges = list(zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True))
+    endless = [
+        i
+        for i, limits in enumerate(ranges)
+        if i not in task.periodic and not np.isfinite(limits).all()
+    ]
+    if len(ranges) != task.observation_size or endless:
+        raise SpaceError(
+            f"a grid needs a finite range of each of the {task.observation_size} observation "
+            f"coordinates; {len(ranges)} ranges are given, coordinates {endless} have no limits: "
+            "set ranges, such as ranges=((-3.0, 3.0), (-8.0, 8.0))"
+        )
+    return list(ranges)
 
 
 def simulate(

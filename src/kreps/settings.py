@@ -1,11 +1,11 @@
-"""Everything that can be chosen about a learner, with its defaults and named recipes."""
+"""Everything that can be chosen about each learner, with its defaults and named recipes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from numbers import Integral, Real
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypeVar, get_args
 
 from kreps.errors import ConfigurationError
 
@@ -16,8 +16,79 @@ Exploration = Literal["bang-bang", "gaussian"]
 
 
 @dataclass(frozen=True)
-class Settings:
+class LearnerSettings:
+    """What every learner has in common.
+
+    Attributes:
+        restart_probability: p, with which the process restarts at each step.
+        window: how many of the latest roll-outs are kept.
+    """
+
+    restart_probability: float = 0.02
+    window: int = 30
+
+    def __post_init__(self) -> None:
+        self._check("restart_probability", Real, "in (0, 1)", lambda v: 0 < v < 1)
+        self._whole("window")
+
+    def _choose(self, name: str, kind: Any) -> None:
+        if getattr(self, name) not in get_args(kind):
+            raise ConfigurationError(
+                f"{name} = {getattr(self, name)!r} is unknown; choose one of "
+                + ", ".join(repr(choice) for choice in get_args(kind))
+            )
+
+    def _positive(self, *names: str) -> None:
+        for name in names:
+            self._check(name, Real, "positive and finite", lambda v: 0 < v < float("inf"))
+
+    def _not_negative(self, *names: str) -> None:
+        for name in names:
+            self._check(name, Real, "finite and >= 0", lambda v: 0 <= v < float("inf"))
+
+    def _whole(self, *names: str) -> None:
+        for name in names:
+            self._check(name, Integral, "a whole number >= 1", lambda v: v >= 1)
+
+    def _check(self, name: str, kind: type, limit: str, holds: Callable[[Any], bool]) -> None:
+        """Take numbers of any make, NumPy's too, and keep them as Python's."""
+        value = getattr(self, name)
+        is_number = isinstance(value, kind) and not isinstance(value, bool)
+        if not (is_number and holds(value)):
+            raise ConfigurationError(f"{name} = {value!r}, but it must be {limit}")
+        object.__setattr__(self, name, int(value) if kind is Integral else float(value))
+
+
+@dataclass(frozen=True)
+class OnPolicySettings(LearnerSettings):
+    """How a learner that explores by its own policy collects its data (Sec. 4.1).
+
+    A roll-out lasts (1 - p) / p steps on expectation.  Beside `LearnerSettings`:
+
+    Attributes:
+        exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``.
+        exploration_scale: standard deviation of the Gaussian one, in units of half the range.
+        initial_rollouts: roll-outs of the first policy.
+        rollouts_per_iteration: roll-outs of the current policy before each later update.
+    """
+
+    exploration: Exploration = "bang-bang"
+    exploration_scale: float = 1.0
+    initial_rollouts: int = 30
+    rollouts_per_iteration: int = 10
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._choose("exploration", Exploration)
+        self._positive("exploration_scale")
+        self._whole("initial_rollouts", "rollouts_per_iteration")
+
+
+@dataclass(frozen=True)
+class Settings(OnPolicySettings):
     """The parameters of REPS with RKHS embeddings; the defaults are the recipe ``"default"``.
+
+    Those of `OnPolicySettings`, and:
 
     Attributes:
         kl_bound: epsilon of Eq. 2 in nats: how far one update may move from the samples.
@@ -30,12 +101,6 @@ class Settings:
         grid_size: centres per coordinate of the grid.
         policy_fit: hyper-parameters of the policy by leave-one-out density, ``"map"`` with priors
             or ``"bounded"`` within hard ranges.
-        exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``.
-        exploration_scale: standard deviation of the Gaussian one, in units of half the range.
-        restart_probability: p; a roll-out lasts (1 - p) / p steps on expectation.
-        initial_rollouts: roll-outs of the first policy.
-        rollouts_per_iteration: roll-outs of the current policy before each later update.
-        window: how many of the latest roll-outs are kept.
         max_rank: most features of V.
         basis_tolerance: the basis of V is complete when no state has a larger squared residual.
     """
@@ -47,48 +112,100 @@ class Settings:
     features: Features = "rkhs"
     grid_size: int = 10
     policy_fit: PolicyFit = "map"
-    exploration: Exploration = "bang-bang"
-    exploration_scale: float = 1.0
-    restart_probability: float = 0.02
-    initial_rollouts: int = 30
-    rollouts_per_iteration: int = 10
-    window: int = 30
     max_rank: int = 400
     basis_tolerance: float = 1e-6
 
     def __post_init__(self) -> None:
-        for name, kind in (
-            ("model", Model),
-            ("features", Features),
-            ("policy_fit", PolicyFit),
-            ("exploration", Exploration),
-        ):
-            if getattr(self, name) not in get_args(kind):
+        super().__post_init__()
+        self._choose("model", Model)
+        self._choose("features", Features)
+        self._choose("policy_fit", PolicyFit)
+        self._positive("kl_bound", "ridge", "basis_tolerance")
+        self._not_negative("eta_floor")
+        self._whole("max_rank", "grid_size")
+
+
+@dataclass(frozen=True)
+class ValueIterationSettings(OnPolicySettings):
+    """The parameters of on-policy value iteration with RKHS embeddings.
+
+    Those of `OnPolicySettings`, and:
+
+    Attributes:
+        temperature: of the softmax, in standard deviations of the reward.
+        actions: candidate actions, evenly spaced over the range: the largest number of levels
+            per dimension whose product does not exceed this, at least two each.
+    """
+
+    temperature: float = 1.0
+    actions: int = 25
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._positive("temperature")
+        self._whole("actions")
+
+
+@dataclass(frozen=True)
+class GridValueIterationSettings(LearnerSettings):
+    """The parameters of off-policy value iteration on a grid of state-action pairs.
+
+    Those of `LearnerSettings`, and the following.  A grid point is a roll-out of one step, and the
+    window holds the latest of them.
+
+    Attributes:
+        ranges: least and largest value of each observation coordinate on the grid; None asks the
+            observation space.  An angle gets a whole turn in any case.
+        actions: candidate actions of the maximisation, as in `ValueIterationSettings`.
+        grid_states: grid points per state coordinate.
+        grid_actions: grid points per action coordinate.
+    """
+
+    window: int = 6000
+    ranges: tuple[tuple[float, float], ...] | None = None
+    actions: int = 25
+    grid_states: int = 15
+    grid_actions: int = 7
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._whole("actions", "grid_states", "grid_actions")
+        if self.ranges is not None:
+            try:
+                ranges = tuple((float(low), float(high)) for low, high in self.ranges)
+            except (TypeError, ValueError):
+                ranges = ((1.0, 0.0),)
+            if not all(-float("inf") < low < high < float("inf") for low, high in ranges):
                 raise ConfigurationError(
-                    f"{name} = {getattr(self, name)!r} is unknown; choose one of "
-                    + ", ".join(repr(choice) for choice in get_args(kind))
+                    f"ranges = {self.ranges!r}, but it must be a pair (least, largest) of finite "
+                    "numbers for each observation coordinate"
                 )
-        for name in ("kl_bound", "ridge", "exploration_scale", "basis_tolerance"):
-            self._check(name, Real, "positive and finite", lambda v: 0 < v < float("inf"))
-        self._check("eta_floor", Real, "finite and >= 0", lambda v: 0 <= v < float("inf"))
-        self._check("restart_probability", Real, "in (0, 1)", lambda v: 0 < v < 1)
-        for name in (
-            "initial_rollouts",
-            "rollouts_per_iteration",
-            "window",
-            "max_rank",
-            "grid_size",
-        ):
-            self._check(name, Integral, "a whole number >= 1", lambda v: v >= 1)
+            object.__setattr__(self, "ranges", ranges)
 
-    def _check(self, name: str, kind: type, limit: str, holds: Callable[[Any], bool]) -> None:
-        """Take numbers of any make, NumPy's too, and keep them as Python's."""
-        value = getattr(self, name)
-        is_number = isinstance(value, kind) and not isinstance(value, bool)
-        if not (is_number and holds(value)):
-            raise ConfigurationError(f"{name} = {value!r}, but it must be {limit}")
-        object.__setattr__(self, name, int(value) if kind is Integral else float(value))
 
+@dataclass(frozen=True)
+class NPALPSettings(OnPolicySettings):
+    """The parameters of non-parametric approximate linear programming.
+
+    Those of `OnPolicySettings`, and:
+
+    Attributes:
+        lipschitz: slope of V, in standard deviations of the reward per median distance of states.
+        noise_fraction: share of the actions that gets exploration noise, in [0, 1].
+        noise_scale: standard deviation of that noise, in units of half the range.
+    """
+
+    lipschitz: float = 10.0
+    noise_fraction: float = 0.3
+    noise_scale: float = 0.3
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._positive("lipschitz", "noise_scale")
+        self._check("noise_fraction", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
+
+
+AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
 
 RECIPES: dict[str, Settings] = {
     "default": Settings(),
@@ -110,10 +227,19 @@ def settings_of(recipe: str | Settings = "default", /, **changes: Any) -> Settin
         raise ConfigurationError(
             f"recipe {recipe!r} is unknown; choose one of {', '.join(map(repr, RECIPES))}"
         )
-    known = [f.name for f in fields(Settings)]
+    return changed(recipe, changes)
+
+
+def changed(settings: AnySettings, changes: Mapping[str, Any]) -> AnySettings:
+    """The settings with some parameters changed.
+
+    Raises:
+        ConfigurationError: unknown parameter, or a value out of range.
+    """
+    known = [f.name for f in fields(settings)]
     unknown = [name for name in changes if name not in known]
     if unknown:
         raise ConfigurationError(
             f"unknown parameter {', '.join(unknown)}; the parameters are {', '.join(known)}"
         )
-    return replace(recipe, **changes)
+    return replace(settings, **changes)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -18,15 +19,16 @@ import numpy as np
 import safetensors
 import safetensors.numpy
 
-from kreps.algorithms.reps import LearnerState
+from kreps.algorithms.state import LearnerState
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Window, is_sane
 from kreps.errors import KrepsError, StorageError
 from kreps.kernels import Kernel
-from kreps.policies import CostSensitiveGP
-from kreps.settings import Settings
+from kreps.policies import CostSensitiveGP, LearntPolicy
+from kreps.settings import AnySettings, LearnerSettings
 from kreps.threads import blas_threads
 from kreps.value import ValueFunction
+from kreps.value_policies import LipschitzPolicy, SoftmaxPolicy
 
 VERSION = 1
 MAX_FILE_BYTES = 2**30
@@ -38,6 +40,12 @@ POLICY_ARRAYS = {
     "policy.targets",
     "policy.weights",
     "policy.signal_and_noise",
+    "policy.table",
+    "policy.candidates",
+    "policy.offset_and_temperature",
+    "policy.actions",
+    "policy.bounds",
+    "policy.slope_and_noise",
 }
 CHECKPOINT_ARRAYS = POLICY_ARRAYS | {
     "value.lengthscales",
@@ -81,7 +89,8 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 def write_arrays(path: Path, kind: str, tensors: Tensors, header: Header) -> None:
     """Write arrays and a JSON header; the same content gives the same bytes."""
-    text = json.dumps({"kind": kind, "version": VERSION, **header}, sort_keys=True)
+    known = {"kind": kind, "version": VERSION, "arrays": sorted(tensors)}
+    text = json.dumps({**known, **header}, sort_keys=True)
     arrays = {name: np.ascontiguousarray(tensors[name]) for name in sorted(tensors)}
     write_atomically(path, safetensors.numpy.save(arrays, metadata={"kreps": text}))
 
@@ -105,6 +114,10 @@ def read_arrays(path: Path, kind: str) -> tuple[Tensors, Header]:
                     raise StorageError(f"a {kind} has no array {name!r:.60}")
                 if file.get_slice(name).get_dtype() != "F64":
                     raise StorageError(f"array {name!r} is not of 64-bit floats")
+            promised = header.get("arrays", [])
+            missing = [n for n in promised if n not in names]
+            if missing:
+                raise StorageError(f"array {missing[0]!r:.60} is missing")
             tensors = {n: np.asarray(file.get_tensor(n)) for n in names}
     except StorageError as error:
         raise StorageError(f"cannot read {path} as a kreps {kind}: {error}") from error
@@ -201,43 +214,145 @@ def _state_kernel(task: TaskSpec, lengthscales: FloatArray) -> Kernel:
     return Kernel(task.state_factors, lengthscales)
 
 
-def _policy_parts(policy: CostSensitiveGP) -> Tensors:
+def _process_parts(policy: CostSensitiveGP) -> Tensors:
     return {
-        "policy.lengthscales": policy.kernel.lengthscales,
-        "policy.states": policy.states,
         "policy.targets": policy.targets,
         "policy.weights": policy.weights,
         "policy.signal_and_noise": np.array([policy.signal, policy.noise]),
     }
 
 
-def _policy_of(tensors: Tensors, task: TaskSpec) -> CostSensitiveGP:
+def _process_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, m: int) -> CostSensitiveGP:
     t = _take(
         tensors,
         {
-            "policy.lengthscales": ("factors",),
             "policy.states": ("m", "ds"),
             "policy.targets": ("m", "da"),
             "policy.weights": ("m",),
             "policy.signal_and_noise": (2,),
         },
-        factors=task.factor_count,
-        ds=task.observation_size,
+        m=m,
         da=task.action_size,
     )
     weights, variances = t["policy.weights"], t["policy.signal_and_noise"]
-    if not (len(weights) > 0 and (weights > 0).all() and (variances > 0).all()):
-        raise StorageError("the policy has no support point, or weights or variances <= 0")
+    if not ((weights > 0).all() and (variances > 0).all()):
+        raise StorageError("the policy has weights or variances <= 0")
     with blas_threads(1):  # as while learning, so that it is the same policy to the last bit
         return CostSensitiveGP(
             task=task,
-            kernel=_state_kernel(task, t["policy.lengthscales"]),
+            kernel=kernel,
             states=t["policy.states"],
             targets=t["policy.targets"],
             weights=weights,
             signal=float(variances[0]),
             noise=float(variances[1]),
         )
+
+
+def _softmax_parts(policy: SoftmaxPolicy) -> Tensors:
+    return {
+        "policy.table": policy.table,
+        "policy.candidates": policy.candidates,
+        "policy.offset_and_temperature": np.array([policy.offset, policy.temperature]),
+    }
+
+
+def _softmax_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, m: int) -> SoftmaxPolicy:
+    t = _take(
+        tensors,
+        {
+            "policy.states": ("m", "ds"),
+            "policy.table": ("m", "k"),
+            "policy.candidates": ("k", "da"),
+            "policy.offset_and_temperature": (2,),
+        },
+        m=m,
+        da=task.action_size,
+    )
+    offset, temperature = t["policy.offset_and_temperature"]
+    if len(t["policy.candidates"]) == 0 or temperature < 0:
+        raise StorageError("the policy has no candidate actions, or a temperature < 0")
+    return SoftmaxPolicy(
+        task,
+        kernel,
+        t["policy.states"],
+        t["policy.table"],
+        float(offset),
+        t["policy.candidates"],
+        float(temperature),
+    )
+
+
+def _lipschitz_parts(policy: LipschitzPolicy) -> Tensors:
+    return {
+        "policy.actions": policy.actions,
+        "policy.bounds": policy.bounds,
+        "policy.slope_and_noise": np.array(
+            [policy.slope, policy.noise_fraction, policy.noise_scale]
+        ),
+    }
+
+
+def _lipschitz_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, m: int) -> LipschitzPolicy:
+    t = _take(
+        tensors,
+        {
+            "policy.states": ("m", "ds"),
+            "policy.actions": ("m", "da"),
+            "policy.bounds": ("m",),
+            "policy.slope_and_noise": (3,),
+        },
+        m=m,
+        da=task.action_size,
+    )
+    slope, fraction, scale = t["policy.slope_and_noise"].tolist()
+    if not (slope >= 0 and 0 <= fraction <= 1 and scale >= 0):
+        raise StorageError("the policy has a slope or noise that is out of range")
+    return LipschitzPolicy(
+        task,
+        kernel,
+        t["policy.states"],
+        t["policy.actions"],
+        t["policy.bounds"],
+        slope,
+        fraction,
+        scale,
+    )
+
+
+_POLICIES: dict[str, tuple[type[Any], Callable[[Any], Tensors], Callable[..., LearntPolicy]]] = {
+    "cost-sensitive-gp": (CostSensitiveGP, _process_parts, _process_of),
+    "softmax": (SoftmaxPolicy, _softmax_parts, _softmax_of),
+    "lipschitz": (LipschitzPolicy, _lipschitz_parts, _lipschitz_of),
+}
+"""By name in files: the class, what to write of it beside kernel and states, how to read it."""
+
+
+def _policy_parts(policy: LearntPolicy) -> tuple[Tensors, str]:
+    """The arrays of a policy, and the name of its kind."""
+    for kind, (owner, parts, _) in _POLICIES.items():
+        if isinstance(policy, owner):
+            common = {
+                "policy.lengthscales": policy.kernel.lengthscales,
+                "policy.states": policy.states,
+            }
+            return common | parts(policy), kind
+    raise StorageError(f"a policy of type {type(policy).__name__} cannot be written to a file")
+
+
+def _policy_of(tensors: Tensors, task: TaskSpec, kind: str) -> LearntPolicy:
+    if kind not in _POLICIES:
+        raise StorageError(f"it holds an unknown kind of policy {kind!r:.40}")
+    t = _take(
+        tensors,
+        {"policy.lengthscales": ("factors",), "policy.states": ("m", "ds")},
+        factors=task.factor_count,
+        ds=task.observation_size,
+    )
+    count = len(t["policy.states"])
+    if count == 0:
+        raise StorageError("the policy has no support point")
+    return _POLICIES[kind][2](tensors, task, _state_kernel(task, t["policy.lengthscales"]), count)
 
 
 def _value_parts(value: ValueFunction) -> Tensors:
@@ -305,35 +420,35 @@ def _window_of(tensors: Tensors, task: TaskSpec, capacity: int) -> Window:
 # ---- policies and checkpoints -----------------------------------------------------------------
 
 
-def save_policy(policy: CostSensitiveGP, path: str | Path) -> None:
-    write_arrays(Path(path), "policy", _policy_parts(policy), {"task": _task_header(policy.task)})
+def save_policy(policy: LearntPolicy, path: str | Path) -> None:
+    tensors, kind = _policy_parts(policy)
+    write_arrays(Path(path), "policy", tensors, {"task": _task_header(policy.task), "policy": kind})
 
 
-def load_policy(path: str | Path) -> CostSensitiveGP:
+def load_policy(path: str | Path) -> LearntPolicy:
     """Raises `StorageError` if the file is not an intact policy."""
     tensors, header = read_arrays(Path(path), "policy")
     try:
-        return _policy_of(tensors, _task_of(header))
+        return _policy_of(tensors, _task_of(header), header["policy"])
     except (KrepsError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise _inconsistent(path, "policy", error) from error
 
 
 def save_checkpoint(
-    path: str | Path, state: LearnerState, task: TaskSpec, settings: Settings, seed: int
+    path: str | Path,
+    method: str,
+    state: LearnerState,
+    task: TaskSpec,
+    settings: LearnerSettings,
+    seed: int,
 ) -> None:
     """Everything that a learner needs to go on exactly where it stands.
 
     No generator state is among it, because none exists: see `kreps.seeding`.
     """
     tensors: Tensors = {}
-    if state.window.rollouts:
-        tensors |= _window_parts(state.window)
-    if state.policy is not None and state.value is not None and state.policy_start is not None:
-        tensors |= _policy_parts(state.policy) | _value_parts(state.value)
-        tensors["start.policy"] = state.policy_start
-    if state.embedding_start is not None:
-        tensors["start.embedding"] = state.embedding_start
-    header = {
+    header: Header = {
+        "method": method,
         "task": _task_header(task),
         "settings": asdict(settings),
         "seed": seed,
@@ -341,15 +456,37 @@ def save_checkpoint(
         "rollouts": state.rollouts,
         "steps": state.steps,
     }
+    if state.window.rollouts:
+        tensors |= _window_parts(state.window)
+    if state.policy is not None:
+        parts, header["policy"] = _policy_parts(state.policy)
+        tensors |= parts
+    if state.value is not None:
+        tensors |= _value_parts(state.value)
+    if state.embedding_start is not None:
+        tensors["start.embedding"] = state.embedding_start
+    if state.policy_start is not None:
+        tensors["start.policy"] = state.policy_start
     write_arrays(Path(path), "checkpoint", tensors, header)
 
 
-def load_checkpoint(path: str | Path) -> tuple[LearnerState, TaskSpec, Settings, int]:
-    """State, task, settings and seed.  Raises `StorageError` if the file is not intact."""
+def load_checkpoint(
+    path: str | Path, method: str, settings_type: type[AnySettings]
+) -> tuple[LearnerState, TaskSpec, AnySettings, int]:
+    """State, task, settings and seed of a learner of this method.
+
+    Raises:
+        StorageError: the file is not intact, or of another method.
+    """
     tensors, header = read_arrays(Path(path), "checkpoint")
+    if header.get("method") != method:
+        raise StorageError(
+            f"{path} is a checkpoint of the method {header.get('method')!s:.40}, not {method}; "
+            "resume it with the class of that method"
+        )
     try:
         task = _task_of(header)
-        settings = Settings(**header["settings"])
+        settings = settings_type(**header["settings"])
         counts = [header[name] for name in ("seed", "iteration", "rollouts", "steps")]
         if not all(isinstance(count, int) and count >= 0 for count in counts):
             raise StorageError(f"seed and counts {counts} are not all whole numbers >= 0")
@@ -357,27 +494,25 @@ def load_checkpoint(path: str | Path) -> tuple[LearnerState, TaskSpec, Settings,
         window = Window(settings.window)
         if "window.lengths" in tensors:
             window = _window_of(tensors, task, settings.window)
-        learnt = iteration > 0
         g = task.factor_count
         state = LearnerState(
             window=window,
             iteration=iteration,
             rollouts=rollouts,
             steps=steps,
-            policy=_policy_of(tensors, task) if learnt else None,
-            value=_value_of(tensors, task) if learnt else None,
-            embedding_start=(
-                _take(tensors, {"start.embedding": (g + task.action_size + 1,)})["start.embedding"]
-                if "start.embedding" in tensors
-                else None
-            ),
-            policy_start=(
-                _take(tensors, {"start.policy": (g + 2,)})["start.policy"] if learnt else None
-            ),
+            policy=_policy_of(tensors, task, header["policy"]) if iteration > 0 else None,
+            value=_value_of(tensors, task) if "value.alpha" in tensors else None,
+            embedding_start=_start_of(tensors, "start.embedding", g + task.action_size + 1),
+            policy_start=_start_of(tensors, "start.policy", g + 2),
         )
     except (KrepsError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise _inconsistent(path, "checkpoint", error) from error
     return state, task, settings, seed
+
+
+def _start_of(tensors: Tensors, name: str, size: int) -> FloatArray | None:
+    """Log hyper-parameters to start from, where the method has any."""
+    return _take(tensors, {name: (size,)})[name] if name in tensors else None
 
 
 def _inconsistent(path: str | Path, kind: str, error: Exception) -> StorageError:

@@ -2,37 +2,34 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from kreps.arrays import FloatArray, IntArray
-from kreps.data import Rollout, TaskSpec, Transitions, Window
+from kreps.algorithms.state import LearnerState, Stopwatch
+from kreps.algorithms.transition_model import (
+    fit_embedding,
+    random_rows,
+    state_kernel,
+    successor_features,
+)
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.dual import (
     DualProblem,
     DualSolution,
+    Outcome,
     effective_sample_size,
     solve_dual,
     standardise,
 )
 from kreps.embedding import KernelEmbedding, SampleModel, TransitionModel
-from kreps.errors import ConfigurationError, DataError
-from kreps.hyperparameters import (
-    EmbeddingLoss,
-    PolicyLoss,
-    Prior,
-    factor_distances,
-    minimise,
-)
-from kreps.kernels import Kernel, SquaredExponential, median_lengthscales
-from kreps.policies import MAX_SUPPORT, CostSensitiveGP
+from kreps.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
+from kreps.kernels import Kernel
+from kreps.policies import CostSensitiveGP
 from kreps.settings import Settings
-from kreps.value import Basis, RBFGrid, RKHSBasis, ValueFunction
-
-FIT_SAMPLE = 400
-"""Samples on which hyper-parameters are fitted: the cost is cubic, the estimate hardly better."""
+from kreps.value import Basis, RBFGrid, RKHSBasis
 
 DROPPED_WEIGHT = 0.05
 """Samples with ``n p_i`` below this do not enter the policy: they say next to nothing."""
@@ -41,26 +38,11 @@ ETA_LEAST = 1e-6
 """Floor of the temperature where none is asked for: below it there is nothing left to gain."""
 
 
-@dataclass(frozen=True)
-class LearnerState:
-    """Everything that is carried from one update to the next: a checkpoint is exactly this.
-
-    Attributes:
-        window: the roll-outs kept.
-        iteration: updates made.
-        rollouts, steps: roll-outs and environment steps seen, forgotten ones included.
-        policy, value: of the latest update.
-        embedding_start, policy_start: log hyper-parameters to start the next fits from.
-    """
-
-    window: Window
-    iteration: int = 0
-    rollouts: int = 0
-    steps: int = 0
-    policy: CostSensitiveGP | None = None
-    value: ValueFunction | None = None
-    embedding_start: FloatArray | None = None
-    policy_start: FloatArray | None = None
+_NOTES = {
+    Outcome.AT_FLOOR: "eta at its floor",
+    Outcome.FALLBACK: "by bisection",
+    Outcome.NOT_CONVERGED: "NOT CONVERGED",
+}
 
 
 @dataclass(frozen=True)
@@ -69,6 +51,7 @@ class UpdateInfo:
 
     Attributes:
         samples: n.
+        kl_bound: epsilon.
         rank: features of V; ``rank_residual`` is the largest squared residual they leave.
         dual: the solution with its certificate.
         effective_samples: effective sample size of the weights.
@@ -82,6 +65,7 @@ class UpdateInfo:
     """
 
     samples: int
+    kl_bound: float
     rank: int
     rank_residual: float
     dual: DualSolution
@@ -93,18 +77,16 @@ class UpdateInfo:
     jitter: float
     seconds: dict[str, float]
 
-
-class _Stopwatch:
-    """CPU seconds between laps, by name."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._last = time.process_time()
-
-    def lap(self, stage: str) -> None:
-        now = time.process_time()
-        self.seconds[stage] = now - self._last
-        self._last = now
+    def shown(self) -> dict[str, str]:
+        """What a progress display shows, by column."""
+        return {
+            "KL / bound": f"{self.dual.kl:.3f} / {self.kl_bound:g}",
+            "eta": f"{self.dual.eta:.3g}",
+            "ESS": f"{self.effective_samples:.0f}",
+            "gap": f"{self.dual.gap:.0e}",
+            "note": f"{_NOTES.get(self.dual.outcome, '')}"
+            + (f"  jitter {self.jitter:.0e}" if self.jitter else ""),
+        }
 
 
 def update(
@@ -119,18 +101,8 @@ def update(
     Raises:
         DataError: no roll-outs at all, or some of another width than the task's.
     """
-    for rollout in rollouts:
-        rollout.check(task)
-    window = state.window.extend(rollouts)
-    if not window.rollouts:
-        raise DataError("there is no roll-out to learn from; give at least one")
-    data = window.transitions
-    if len(data) > MAX_SUPPORT:
-        raise ConfigurationError(
-            f"{len(data)} samples are kept, but the exact update takes at most {MAX_SUPPORT}, as "
-            f"it costs their cube; keep fewer than {len(window.rollouts)} roll-outs: lower window"
-        )
-    clock = _Stopwatch()
+    window, data = state.extended(rollouts, task)
+    clock = Stopwatch()
 
     # Eq. 3: a basis of V, chosen among the sampled states
     kernel = state_kernel(data, task, rng)
@@ -165,12 +137,9 @@ def update(
     policy = fit_policy(support, kernel, task, policy_x)
     clock.lap("policy")
 
-    new_state = replace(
-        state,
-        window=window,
-        iteration=state.iteration + 1,
-        rollouts=state.rollouts + len(rollouts),
-        steps=state.steps + sum(len(r) for r in rollouts),
+    new_state = state.after(
+        rollouts,
+        window,
         policy=policy,
         value=basis.value_function(reward_unit * dual.theta),
         embedding_start=embedding_start,
@@ -178,6 +147,7 @@ def update(
     )
     info = UpdateInfo(
         samples=len(data),
+        kl_bound=settings.kl_bound,
         rank=features.shape[1],
         rank_residual=basis.residual,
         dual=dual,
@@ -196,12 +166,6 @@ def update(
     return new_state, info
 
 
-def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) -> Kernel:
-    """The kernel over states at the median lengthscales."""
-    factors = task.state_factors
-    return Kernel(factors, median_lengthscales(factors, data.points, rng))
-
-
 def value_basis(data: Transitions, kernel: Kernel, settings: Settings) -> tuple[Basis, FloatArray]:
     """The basis of V, and the features (m, r) of all points."""
     if settings.features == "grid":
@@ -209,13 +173,6 @@ def value_basis(data: Transitions, kernel: Kernel, settings: Settings) -> tuple[
     return RKHSBasis.fit(
         kernel, data.points, tolerance=settings.basis_tolerance, max_rank=settings.max_rank
     )
-
-
-def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
-    """Observed ``phi(s'_i)``, (n, r); after a real end the start states are the successor."""
-    successors = features[data.successor]
-    successors[data.terminated] = features[data.start].mean(axis=0)
-    return successors
 
 
 def transition_model(
@@ -230,24 +187,7 @@ def transition_model(
     """The transition model, and the log hyper-parameters it was fitted with."""
     if settings.model == "sample":
         return SampleModel(), None
-    actions = (task.clip(data.actions) - task.action_centre) / task.action_scale
-    inputs = np.concatenate([data.states, actions], axis=1)
-    action_factors = tuple(
-        SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
-    )
-    factors = (*state_kernel.factors, *action_factors)
-    sample = random_rows(len(inputs), rng)
-    median = np.log(median_lengthscales(factors, inputs, rng))
-    prior = Prior(
-        centre=np.append(median, 0.0),
-        spread=np.ones(len(factors) + 1),
-        low=np.append(median - 3.0, np.log(1e-6)),
-        high=np.append(median + 3.0, 0.0),
-        strength=0.0,
-    )
-    loss = EmbeddingLoss(factor_distances(factors, inputs[sample]), successors[sample])
-    x = minimise(loss, prior, np.append(median, np.log(1e-3)) if start is None else start)
-    return KernelEmbedding.fit(Kernel(factors, np.exp(x[:-1])), inputs, float(np.exp(x[-1]))), x
+    return fit_embedding(data, successors, state_kernel, task, start, rng)
 
 
 def feature_differences(
@@ -280,7 +220,7 @@ class PolicySamples:
     @classmethod
     def of(cls, data: Transitions, p: FloatArray, task: TaskSpec) -> PolicySamples:
         kept = len(p) * p >= DROPPED_WEIGHT
-        targets = (data.actions[kept] - task.action_centre) / task.action_scale
+        targets = task.scaled(data.actions[kept])
         return cls(data.states[kept], targets, p[kept] * effective_sample_size(p))
 
 
@@ -337,10 +277,3 @@ def fit_policy(
         signal=float(np.exp(x[-2])),
         noise=float(np.exp(x[-1])),
     )
-
-
-def random_rows(n: int, rng: np.random.Generator) -> IntArray:
-    """At most `FIT_SAMPLE` row numbers out of n, in order."""
-    if n <= FIT_SAMPLE:
-        return np.arange(n)
-    return np.sort(rng.choice(n, FIT_SAMPLE, replace=False))

@@ -32,3 +32,11 @@ class BatchModel(Protocol):
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Successors (m, k), rewards (m,) and ends (m,) for actions (m, da)."""
         ...
+
+
+class SettableModel(BatchModel, Protocol):
+    """A simulator that can be started anywhere, which robots and most environments cannot."""
+
+    def states_at(self, observations: FloatArray) -> FloatArray:
+        """States (m, k) that are observed as ``observations`` (m, ds)."""
+        ...

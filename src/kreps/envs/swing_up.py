@@ -62,6 +62,9 @@ class SwingUpBatch:
     def observe(self, states: FloatArray) -> FloatArray:
         return states
 
+    def states_at(self, observations: FloatArray) -> FloatArray:
+        return observations.copy()
+
     def step(
         self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
     ) -> tuple[FloatArray, FloatArray, BoolArray]:

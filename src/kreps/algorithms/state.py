@@ -1,0 +1,101 @@
+"""What a learner carries from one update to the next, whatever its method."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec, Transitions, Window
+from kreps.errors import ConfigurationError, DataError
+from kreps.policies import MAX_SUPPORT, LearntPolicy
+from kreps.value import ValueFunction
+
+
+@dataclass(frozen=True)
+class LearnerState:
+    """Everything that is carried from one update to the next: a checkpoint is exactly this.
+
+    Attributes:
+        window: the roll-outs kept.
+        iteration: updates made.
+        rollouts, steps: roll-outs and environment steps seen, forgotten ones included.
+        policy: of the latest update.
+        value: V of the latest update, if the method has one in an RKHS.
+        embedding_start, policy_start: log hyper-parameters to start the next fits from, if the
+            method fits any.
+    """
+
+    window: Window
+    iteration: int = 0
+    rollouts: int = 0
+    steps: int = 0
+    policy: LearntPolicy | None = None
+    value: ValueFunction | None = None
+    embedding_start: FloatArray | None = None
+    policy_start: FloatArray | None = None
+
+    def extended(self, rollouts: Sequence[Rollout], task: TaskSpec) -> tuple[Window, Transitions]:
+        """The window with new roll-outs, and its transitions.
+
+        Raises:
+            DataError: no roll-outs at all, or some of another width than the task's.
+            ConfigurationError: more samples than an exact update can serve.
+        """
+        for rollout in rollouts:
+            rollout.check(task)
+        window = self.window.extend(rollouts)
+        if not window.rollouts:
+            raise DataError("there is no roll-out to learn from; give at least one")
+        data = window.transitions
+        if len(data) > MAX_SUPPORT:
+            raise ConfigurationError(
+                f"{len(data)} samples are kept, but the exact update takes at most {MAX_SUPPORT}, "
+                f"as it costs their cube; keep fewer than {len(window.rollouts)} roll-outs: lower "
+                "window"
+            )
+        return window, data
+
+    def after(self, rollouts: Sequence[Rollout], window: Window, **learnt: Any) -> LearnerState:
+        """The state after an update from new ``rollouts``, with what was ``learnt`` replaced."""
+        return replace(
+            self,
+            window=window,
+            iteration=self.iteration + 1,
+            rollouts=self.rollouts + len(rollouts),
+            steps=self.steps + sum(len(r) for r in rollouts),
+            **learnt,
+        )
+
+
+class UpdateReport(Protocol):
+    """What every method reports of an update."""
+
+    @property
+    def samples(self) -> int:
+        """n."""
+        ...
+
+    @property
+    def seconds(self) -> dict[str, float]:
+        """CPU seconds by stage."""
+        ...
+
+    def shown(self) -> dict[str, str]:
+        """What a progress display shows, by column."""
+        ...
+
+
+class Stopwatch:
+    """CPU seconds between laps, by name."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.process_time()
+
+    def lap(self, stage: str) -> None:
+        now = time.process_time()
+        self.seconds[stage] = now - self._last
+        self._last = now

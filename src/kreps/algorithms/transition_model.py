@@ -1,0 +1,71 @@
+"""The conditional embedding fitted to a window of transitions, as several methods need it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kreps.arrays import FloatArray, IntArray
+from kreps.data import TaskSpec, Transitions
+from kreps.embedding import KernelEmbedding
+from kreps.hyperparameters import EmbeddingLoss, Prior, factor_distances, minimise
+from kreps.kernels import Kernel, SquaredExponential, median_lengthscales
+
+FIT_SAMPLE = 400
+"""Samples on which hyper-parameters are fitted: the cost is cubic, the estimate hardly better."""
+
+
+def random_rows(n: int, rng: np.random.Generator) -> IntArray:
+    """At most `FIT_SAMPLE` row numbers out of n, in order."""
+    if n <= FIT_SAMPLE:
+        return np.arange(n)
+    return np.sort(rng.choice(n, FIT_SAMPLE, replace=False))
+
+
+def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) -> Kernel:
+    """The kernel over states at the median lengthscales."""
+    factors = task.state_factors
+    return Kernel(factors, median_lengthscales(factors, data.points, rng))
+
+
+def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
+    """Observed ``phi(s'_i)``, (n, r); after a real end the start states are the successor."""
+    successors = features[data.successor]
+    successors[data.terminated] = features[data.start].mean(axis=0)
+    return successors
+
+
+def fit_embedding(
+    data: Transitions,
+    successors: FloatArray,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+) -> tuple[KernelEmbedding, FloatArray]:
+    """The embedding (Eq. 4) on states and applied actions, and its log hyper-parameters.
+
+    Args:
+        data: n transitions.
+        successors: (n, r) features of the observed successors: what is to be predicted.
+        state_kernel: its factors are those of the embedding's kernel, with other lengthscales.
+        task: limits and scale of the actions.
+        start: log hyper-parameters (g + da + 1,) to start the fit from; None for the median.
+        rng: chooses the samples of the fit.
+    """
+    inputs = np.concatenate([data.states, task.scaled(task.clip(data.actions))], axis=1)
+    action_factors = tuple(
+        SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
+    )
+    factors = (*state_kernel.factors, *action_factors)
+    sample = random_rows(len(inputs), rng)
+    median = np.log(median_lengthscales(factors, inputs, rng))
+    prior = Prior(
+        centre=np.append(median, 0.0),
+        spread=np.ones(len(factors) + 1),
+        low=np.append(median - 3.0, np.log(1e-6)),
+        high=np.append(median + 3.0, 0.0),
+        strength=0.0,
+    )
+    loss = EmbeddingLoss(factor_distances(factors, inputs[sample]), successors[sample])
+    x = minimise(loss, prior, np.append(median, np.log(1e-3)) if start is None else start)
+    return KernelEmbedding.fit(Kernel(factors, np.exp(x[:-1])), inputs, float(np.exp(x[-1]))), x

@@ -1,0 +1,180 @@
+"""Value iteration with RKHS embeddings (Gruenewaelder et al. 2012), the greedy rival of Sec. 4.2.
+
+``Q(s, a) = sum_i beta_i(s, a) (r_i + gamma V(s'_i))`` with the embedding strengths beta of Eq. 4
+and V the maximum of Q over candidate actions, or a soft maximum on-policy, iterated to a
+fixed point.  The process restarts with probability p, hence ``gamma = 1 - p``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from kreps.algorithms.state import LearnerState, Stopwatch
+from kreps.algorithms.transition_model import fit_embedding, state_kernel, successor_features
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec, Transitions
+from kreps.dual import standardise
+from kreps.embedding import KernelEmbedding
+from kreps.kernels import Kernel
+from kreps.settings import GridValueIterationSettings, ValueIterationSettings
+from kreps.value import RKHSBasis
+from kreps.value_policies import SoftmaxPolicy, soft_maximum
+
+MAX_SWEEPS = 1000
+TOLERANCE = 1e-3
+"""Of V between sweeps, up to a constant, in standard deviations of the reward."""
+
+MAX_RANK = 400
+BASIS_TOLERANCE = 1e-6
+"""Of the features that the embedding is fitted to predict, as in REPS."""
+
+
+@dataclass(frozen=True)
+class ValueIterationInfo:
+    """What is only reported of an update.
+
+    Attributes:
+        samples: n.
+        sweeps: of value iteration.
+        change: of V in the last sweep, up to a constant, in standard deviations of the reward.
+        embedding_parameters: fitted lengthscales and lambda.
+        seconds: CPU seconds by stage.
+    """
+
+    samples: int
+    sweeps: int
+    change: float
+    embedding_parameters: FloatArray
+    seconds: dict[str, float]
+
+    @property
+    def converged(self) -> bool:
+        return self.change <= TOLERANCE
+
+    def shown(self) -> dict[str, str]:
+        """What a progress display shows, by column."""
+        return {
+            "sweeps": f"{self.sweeps}",
+            "change": f"{self.change:.0e}",
+            "note": "" if self.converged else "NOT CONVERGED",
+        }
+
+
+def update(
+    state: LearnerState,
+    rollouts: Sequence[Rollout],
+    task: TaskSpec,
+    settings: ValueIterationSettings | GridValueIterationSettings,
+    rng: np.random.Generator,
+) -> tuple[LearnerState, ValueIterationInfo]:
+    """A policy from the window's transitions; nothing is modified.
+
+    Raises:
+        DataError: no roll-outs at all, or some of another width than the task's.
+    """
+    window, data = state.extended(rollouts, task)
+    clock = Stopwatch()
+    kernel = state_kernel(data, task, rng)
+    _, features = RKHSBasis.fit(kernel, data.points, tolerance=BASIS_TOLERANCE, max_rank=MAX_RANK)
+    clock.lap("basis")
+    model, start = fit_embedding(
+        data, successor_features(data, features), kernel, task, state.embedding_start, rng
+    )
+    clock.lap("embedding")
+    rewards, unit = standardise(data.rewards)
+    temperature = settings.temperature if isinstance(settings, ValueIterationSettings) else 0.0
+    candidates = candidate_actions(task, settings.actions)
+    table, offset, sweeps, change = iterate_values(
+        model, data, rewards, candidates, temperature, 1.0 - settings.restart_probability
+    )
+    clock.lap("sweeps")
+    policy = SoftmaxPolicy(
+        task,
+        _on_states(model.kernel, task),
+        data.states,
+        unit * table,
+        unit * offset + float(data.rewards.max()) / settings.restart_probability,
+        candidates,
+        unit * temperature,
+    )
+    new_state = state.after(rollouts, window, policy=policy, embedding_start=start)
+    info = ValueIterationInfo(len(data), sweeps, change, np.exp(start), clock.seconds)
+    return new_state, info
+
+
+def candidate_actions(task: TaskSpec, count: int) -> FloatArray:
+    """At most ``count`` evenly spaced scaled actions (k, da), limits included."""
+    levels = max(2, int(count ** (1.0 / task.action_size) + 1e-9))
+    axes = [np.linspace(-1.0, 1.0, levels)] * task.action_size
+    return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
+
+
+def iterate_values(
+    model: KernelEmbedding,
+    data: Transitions,
+    rewards: FloatArray,
+    candidates: FloatArray,
+    temperature: float,
+    gamma: float,
+) -> tuple[FloatArray, float, int, float]:
+    """The fixed point of ``Q(s, a) = sum_i beta_i(s, a) (r_i + gamma V(s'_i))``.
+
+    The strengths beta need not add up to one, so that far from the data a sum over them fades to
+    zero: they are applied to the targets less their mean, to which Q then fades.
+
+    Args:
+        model: on states and scaled actions, as it was fitted to ``data``.
+        data: n transitions.
+        rewards: (n,), standardised.
+        candidates: (k, da) scaled actions.
+        temperature: of the soft maximum; zero for the maximum.
+        gamma: discount.
+
+    Returns:
+        Table (n, k) and offset with ``Q(s, a_k) = offset + sum_i k_s(s_i, s) table_ik``, sweeps
+        made, and the change of V (up to a constant) in the last one.
+    """
+    ds = data.points.shape[1]
+    by_state, by_action = _split(model.kernel, ds)
+    states = by_state.gram(data.states, data.points).T  # (points, n)
+    actions = by_action.gram(model.inputs, _beside(candidates, ds))  # (n, k)
+    least, most = rewards.min() / (1.0 - gamma), rewards.max() / (1.0 - gamma)
+    values = np.zeros(len(data.points))
+    sweeps = 0
+    while True:
+        sweeps += 1
+        successors = values[data.successor]
+        successors[data.terminated] = values[data.start].mean()
+        targets = rewards + gamma * successors
+        offset = float(targets.mean())
+        table = model.factor.solve(targets - offset)[:, None] * actions
+        # what rewards in this range can add up to bounds an expectation that is none
+        fresh = np.clip(soft_maximum(offset + states @ table, temperature), least, most)
+        difference = fresh - values
+        change = float(difference.max() - difference.min())
+        values = fresh
+        if change <= TOLERANCE or sweeps == MAX_SWEEPS:
+            return table, offset, sweeps, change
+
+
+def _split(kernel: Kernel, observation_size: int) -> tuple[Kernel, Kernel]:
+    """The factors of a kernel that see states, and those that see actions."""
+    of_state = [max(factor.dims) < observation_size for factor in kernel.factors]
+
+    def part(wanted: bool) -> Kernel:
+        chosen = [i for i, is_state in enumerate(of_state) if is_state is wanted]
+        return Kernel(tuple(kernel.factors[i] for i in chosen), kernel.lengthscales[chosen])
+
+    return part(True), part(False)
+
+
+def _on_states(kernel: Kernel, task: TaskSpec) -> Kernel:
+    return _split(kernel, task.observation_size)[0]
+
+
+def _beside(actions: FloatArray, observation_size: int) -> FloatArray:
+    """Actions in their columns of the kernel's input; the states' columns do not matter."""
+    return np.concatenate([np.zeros((len(actions), observation_size)), actions], axis=1)
