@@ -4,34 +4,25 @@ from __future__ import annotations
 
 import json
 import sys
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 import kreps
-from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import ConfigurationError, EnvironmentFailure, KrepsError
 from kreps.evaluation import EPISODES, STEPS
-from kreps.experiments.runner import (
-    TABLE_HEADINGS,
-    cells_of,
-    commits_of,
-    rows_of,
-    run_cells,
-    table_rows,
-    write_results,
-)
-from kreps.experiments.specs import EXPERIMENTS
+from kreps.experiments.claims import write_claims
+from kreps.experiments.executors import executor
+from kreps.experiments.figures import draw_features, write_figure
+from kreps.experiments.runner import figure_cells, name_of, run_cells
+from kreps.experiments.search import CANDIDATES, search_cells, write_search
+from kreps.experiments.specs import FIGURES, PICTURES
 from kreps.learner import KREPS
 from kreps.report import (
-    console,
     evaluate_run,
     film_run,
     make_environment,
@@ -51,6 +42,11 @@ app = typer.Typer(
     "[bold]Start here:[/bold]  kreps train kreps/SwingUp-v0 --out runs/swing-up",
 )
 
+WorkersOption = Annotated[int, typer.Option(min=1, help="Processes side by side.")]
+SchedulerOption = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Run on the Dask cluster of this scheduler instead."),
+]
 RunArgument = Annotated[Path, typer.Argument(help="Folder of the run.", show_default=False)]
 
 
@@ -185,50 +181,82 @@ def video(
 
 @app.command(
     epilog="Examples:\n\n"
-    "  kreps reproduce swing-up --trials 10 --workers 2\n\n"
-    "  kreps reproduce swing-up --trials 2 --iterations 5 --out small"
+    "  kreps reproduce figure-1b --trials 10 --workers 2\n\n"
+    "  kreps reproduce all\n\n"
+    "  kreps reproduce figure-1a --trials 2 --iterations 3 --out small\n\n"
+    "  kreps reproduce figure-1b --scheduler tcp://head-node:8786"
 )
 def reproduce(
-    experiment: Annotated[str, typer.Argument(help=f"One of: {', '.join(EXPERIMENTS)}.")],
+    figure: Annotated[
+        str, typer.Argument(help=f"One of: {', '.join((*FIGURES, *PICTURES, 'all'))}.")
+    ],
     trials: Annotated[int, typer.Option(min=1, help="Seeds 0 to TRIALS - 1.")] = 10,
-    workers: Annotated[int, typer.Option(min=1, help="Processes side by side.")] = 2,
+    workers: WorkersOption = 2,
     iterations: Annotated[
-        int | None, typer.Option(min=1, help="Policy updates; the experiment's own if not given.")
+        int | None, typer.Option(min=1, help="Policy updates; the task's own if not given.")
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("results"),
+    scheduler: SchedulerOption = None,
 ) -> None:
-    """Repeat a comparison over many seeds and draw its figure.
+    """Repeat a figure of the paper over many seeds, draw it and test the paper's claims.
 
-    Each cell (method x seed) is kept when it is done: stop at any time and call it again.
+    Each cell (method x task x seed) is kept when it is done: stop at any time and call it again.
+    Figures share cells, so [bold]all[/bold] costs less than its parts.
     """
-    from kreps import plotting
-
-    if experiment not in EXPERIMENTS:
+    known = (*FIGURES, *PICTURES)
+    if figure not in (*known, "all"):
         raise ConfigurationError(
-            f"experiment {experiment!r} is unknown; choose one of {', '.join(EXPERIMENTS)}"
+            f"figure {figure!r} is unknown; choose one of {', '.join((*known, 'all'))}"
         )
-    spec = EXPERIMENTS[experiment]
-    command = f"kreps reproduce {experiment} --trials {trials}"
+    wanted = known if figure == "all" else (figure,)
+    command = f"kreps reproduce {figure} --trials {trials}"
     if iterations is not None:
         command += f" --iterations {iterations}"
-    cells = cells_of(spec, trials, iterations)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as executor:
-        results = run_cells(cells, executor, out / "cells" / experiment)
-    summary = write_results(out, experiment, command, spec, results)
-    figure = plotting.comparison(
-        rows_of(results),
-        REFERENCE_REWARDS.get(spec.environment, {}),
-        f"{spec.environment}: every seed",
-        f"{command}   (commit {commits_of(results)})",
-    )
-    table = Table(title=f"{experiment}: average reward per step after the last update")
-    for heading in TABLE_HEADINGS:
-        table.add_column(heading)
-    for row in table_rows(summary):
-        table.add_row(*row)
-    console.print(table)
-    say(f"Results:   {out / experiment}.csv, {out / experiment}.json")
-    say(f"Figure:    {plotting.save(figure, out / f'{experiment}.png')}")
+    cells = {name: figure_cells(name, trials, iterations) for name in wanted if name in FIGURES}
+    with executor(workers, scheduler) as pool:
+        every_cell = [cell for of_figure in cells.values() for cell in of_figure]
+        results = run_cells(every_cell, pool, out / "cells")
+    for name in wanted:
+        if name in FIGURES:
+            mine = {cell.name for cell in cells[name]}
+            chosen = [result for result in results if name_of(result) in mine]
+            for path in write_figure(out, name, command, chosen):
+                say(f"wrote {path}")
+        else:
+            say(f"drew {draw_features(out / f'{name}.png')}")
+    for path in write_claims(out):
+        say(f"wrote {path}")
+
+
+@app.command(epilog="Examples:\n\n  kreps search --workers 2\n\n  kreps search reaching --out try")
+def search(
+    tasks: Annotated[
+        list[str] | None, typer.Argument(help=f"Some of: {', '.join(CANDIDATES)}; all if none.")
+    ] = None,
+    workers: WorkersOption = 2,
+    out: Annotated[Path, typer.Option(help="Folder for results.")] = Path("results"),
+    scheduler: SchedulerOption = None,
+) -> None:
+    """Search the parameters of every compared method: as many candidates for each, same seeds.
+
+    The outcome is OUT/search.json.  Figures use the one in src/kreps/experiments: copy it there.
+    """
+    unknown = [task for task in tasks or () if task not in CANDIDATES]
+    if unknown:
+        raise ConfigurationError(
+            f"task {unknown[0]!r} is unknown; choose some of {', '.join(CANDIDATES)}"
+        )
+    cells = [
+        cell
+        for task in tasks or CANDIDATES
+        for method in CANDIDATES[task]
+        for of_candidate in search_cells(task, method)
+        for cell in of_candidate
+    ]
+    with executor(workers, scheduler) as pool:
+        results = run_cells(cells, pool, out / "cells" / "search")
+    command = " ".join(["kreps search", *(tasks or ())])
+    say(f"wrote {write_search(out / 'search.json', command, tasks or list(CANDIDATES), results)}")
 
 
 def main() -> None:

@@ -338,3 +338,109 @@ def _draw_seeds(axes: Axes, rows: Sequence[Mapping[str, Any]], name: str) -> Non
             steps, mean - band, mean + band, color=ORANGE, alpha=0.25, lw=0, label="± 2 s.e."
         )
     axes.legend(loc="lower right")
+
+
+COLOURS = ("#20639b", "#d1603d", "#3caea3", "#8e5ea2", "#5b6068")
+"""Of the curves of a figure, in their order; so are the line styles, for who sees no colours."""
+LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)))
+
+PANELS = (
+    ("training_reward", "iteration", "As in the paper: training roll-outs"),
+    ("stochastic", "steps", "Evaluated, with exploration"),
+    ("greedy", "steps", "Evaluated, without exploration"),
+)
+
+
+def learning_curves(
+    rows: Sequence[Mapping[str, Any]], references: Mapping[str, float], title: str, source: str
+) -> Figure:
+    """Mean and twice the standard error of every method: by iteration, and by environment steps.
+
+    A method with one iteration only is a level line, in the first panel at its evaluated reward.
+
+    Args:
+        rows: of a figure, one per method, seed and iteration.
+        references: values to draw as lines, by name.
+        title: of the figure.
+        source: command and commit that made it, printed below.
+    """
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    with rc_context(STYLE):
+        figure = Figure(figsize=(13.0, 5.0))
+        plots = figure.subplots(1, len(PANELS), sharey=True)
+        for method, colour, line in zip(methods, COLOURS, LINES, strict=False):
+            mine = [row for row in rows if row["method"] == method]
+            for axes, (value, by, _) in zip(plots, PANELS, strict=True):
+                _draw_mean(axes, mine, value, by, method, colour, line)
+        shown = [row[name] for row in rows for name in ("stochastic", "greedy")]
+        low, high = min([*references.values(), *_quantiles(shown)]), max(references.values())
+        for axes, (_, by, heading) in zip(plots, PANELS, strict=True):
+            axes.set_title(heading)
+            axes.set_xlabel("iteration" if by == "iteration" else "environment steps")
+            axes.set_ylim(low - 0.06 * (high - low), high + 0.10 * (high - low))
+            draw_references(axes, references, named=axes is plots[-1])
+        plots[0].set_ylabel("average reward per step")
+        handles, labels = plots[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside upper center", ncols=3)
+        figure.suptitle(title, fontweight="bold", x=0.01, ha="left", fontsize=10)
+        figure.supxlabel(source, fontsize=6.5, color=GREY)
+    return figure
+
+
+def _quantiles(values: Sequence[float]) -> list[float]:
+    return [float(q) for q in np.quantile(values, (0.01, 0.99))]
+
+
+def _draw_mean(
+    axes: Axes,
+    rows: Sequence[Mapping[str, Any]],
+    value: str,
+    by: str,
+    name: str,
+    colour: str,
+    line: Any,
+) -> None:
+    """One curve with its band; a level line if there is one iteration only."""
+    iterations = sorted({row["iteration"] for row in rows})
+    once = len(iterations) == 1
+    if once and value == "training_reward":
+        value = "stochastic"  # no roll-outs of a policy were trained on
+    columns = [[row for row in rows if row["iteration"] == i] for i in iterations]
+    x = np.array([np.mean([row[by] for row in column]) for column in columns])
+    mean = np.array([np.mean([row[value] for row in column]) for column in columns])
+    error = np.array(
+        [
+            2 * np.std([row[value] for row in c], ddof=1) / np.sqrt(len(c)) if len(c) > 1 else 0.0
+            for c in columns
+        ]
+    )
+    if once:
+        axes.axhline(mean[0], color=colour, ls=line, lw=1.6, label=f"{name}, one iteration")
+        axes.axhspan(mean[0] - error[0], mean[0] + error[0], color=colour, alpha=0.15, lw=0)
+        return
+    axes.plot(x, mean, color=colour, ls=line, lw=1.6, label=name)
+    axes.fill_between(x, mean - error, mean + error, color=colour, alpha=0.18, lw=0)
+
+
+def image_features(observations: FloatArray, times: Sequence[float], pixels: int) -> Figure:
+    """Images above their differences to the one before (Fig. 2a).
+
+    Args:
+        observations: (m, 2 pixels^2).
+        times: (m,) in s.
+        pixels: of each side of an image.
+    """
+    with rc_context(STYLE):
+        figure = Figure(figsize=(1.5 * len(times), 3.5))
+        plots = figure.subplots(2, len(times))
+        for column, (observation, time) in enumerate(zip(observations, times, strict=True)):
+            both = observation.reshape(2, pixels, pixels)
+            plots[0, column].imshow(both[0], cmap="gray", vmin=0.0, vmax=1.0)
+            plots[1, column].imshow(both[1], cmap="gray", vmin=-1.0, vmax=1.0)
+            plots[0, column].set_title(f"{time:.2f} s", fontweight="normal", loc="center")
+        for axes in plots.flat:
+            axes.set_xticks([])
+            axes.set_yticks([])
+        plots[0, 0].set_ylabel("image")
+        plots[1, 0].set_ylabel("difference")
+    return figure

@@ -21,6 +21,7 @@ class Purpose(IntEnum):
     EVALUATION_POLICY = 4
     PREDICT = 5
     RESTART = 6
+    BOOTSTRAP = 7
 
 
 def _sequence(seed: int, purpose: Purpose, indices: tuple[int, ...]) -> np.random.SeedSequence:

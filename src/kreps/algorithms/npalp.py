@@ -47,6 +47,10 @@ class NPALPInfo:
     residual: float
     seconds: dict[str, float]
 
+    def numbers(self) -> dict[str, float]:
+        """The diagnostics of the method, by name."""
+        return {"improvements": self.improvements, "residual": self.residual}
+
     def shown(self) -> dict[str, str]:
         """What a progress display shows, by column."""
         return {"improvements": f"{self.improvements}", "residual": f"{self.residual:.0e}"}

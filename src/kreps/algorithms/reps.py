@@ -77,6 +77,15 @@ class UpdateInfo:
     jitter: float
     seconds: dict[str, float]
 
+    def numbers(self) -> dict[str, float]:
+        """The diagnostics of the method, by name."""
+        return {
+            "kl": self.dual.kl,
+            "eta": self.dual.eta,
+            "gap": self.dual.gap,
+            "effective_samples": self.effective_samples,
+        }
+
     def shown(self) -> dict[str, str]:
         """What a progress display shows, by column."""
         return {

@@ -83,6 +83,10 @@ class UpdateReport(Protocol):
         """CPU seconds by stage."""
         ...
 
+    def numbers(self) -> dict[str, float]:
+        """The diagnostics of the method, by name."""
+        ...
+
     def shown(self) -> dict[str, str]:
         """What a progress display shows, by column."""
         ...

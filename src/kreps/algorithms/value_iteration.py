@@ -54,6 +54,10 @@ class ValueIterationInfo:
     def converged(self) -> bool:
         return self.change <= TOLERANCE
 
+    def numbers(self) -> dict[str, float]:
+        """The diagnostics of the method, by name."""
+        return {"sweeps": self.sweeps, "change": self.change}
+
     def shown(self) -> dict[str, str]:
         """What a progress display shows, by column."""
         return {

@@ -13,8 +13,10 @@ import gymnasium as gym
 
 from kreps.errors import StorageError
 from kreps.evaluation import evaluate, stochastic_and_greedy
-from kreps.learner import KREPS, IterationReport
+from kreps.experiments.specs import METHODS, TASKS
+from kreps.learner import LEARNERS, IterationReport, Learner
 from kreps.progress import seconds_by_stage
+from kreps.settings import OnPolicySettings
 from kreps.storage import write_atomically
 from kreps.threads import blas_threads
 
@@ -24,24 +26,63 @@ class Cell:
     """What one worker is asked to do; made of plain values, so that it travels between processes.
 
     Attributes:
-        method: name that is shown.
-        recipe, settings: as `kreps.KREPS` takes them.
-        environment, iterations, seed: likewise.
+        task, method: names that are shown.
+        environment: Gymnasium name.
+        learner: a name of `kreps.learner.LEARNERS`.
+        options: of its constructor.
+        iterations, seed: as it takes them.
+        episodes: of the evaluations on the way, and of the last one.
+        label: tells apart cells of one method with other options.
     """
 
+    task: str
     method: str
-    recipe: str
-    settings: Mapping[str, Any]
     environment: str
+    learner: str
+    options: Mapping[str, Any]
     iterations: int
     seed: int
+    episodes: tuple[int, int]
+    label: str = ""
 
     @property
     def name(self) -> str:
-        return f"{re.sub(r'[^a-z0-9]+', '-', self.method.lower()).strip('-')}-seed-{self.seed}"
+        return f"{_slug(self.task)}/{_slug(f'{self.method} {self.label} seed {self.seed}')}"
 
     def description(self) -> dict[str, Any]:
-        return {**vars(self), "settings": dict(self.settings)}
+        return {**vars(self), "options": dict(self.options)}
+
+
+def _slug(name: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
+
+
+def cell_of(
+    task_name: str,
+    method_name: str,
+    seed: int,
+    options: Mapping[str, Any],
+    *,
+    iterations: int | None,
+    episodes: tuple[int, int],
+    label: str = "",
+) -> Cell:
+    """The cell of a task, a method and a seed, with ``options`` beside the method's own."""
+    task, method = TASKS[task_name], METHODS[method_name]
+    explores = issubclass(LEARNERS[method.learner].settings_type, OnPolicySettings)
+    protocol = dict(task.exploration) if explores else {"ranges": task.ranges}
+    wanted = task.iterations if iterations is None else iterations
+    return Cell(
+        task=task_name,
+        method=method_name,
+        environment=task.environment,
+        learner=method.learner,
+        options={**protocol, **method.options, **options},
+        iterations=1 if method.once else wanted,
+        seed=seed,
+        episodes=episodes,
+        label=label,
+    )
 
 
 def run_cell(cell: Cell) -> dict[str, Any]:
@@ -53,9 +94,10 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     env = gym.make(cell.environment)
     rows: list[dict[str, Any]] = []
 
-    def evaluated(learner: KREPS, report: IterationReport) -> None:
+    def evaluated(learner: Learner[Any], report: IterationReport) -> None:
         assert learner.state.policy is not None
         row: dict[str, Any] = {
+            "task": cell.task,
             "method": cell.method,
             "seed": cell.seed,
             "iteration": report.iteration,
@@ -69,6 +111,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
                     learner.task,
                     policy,
                     restart_probability=learner.settings.restart_probability,
+                    episodes=cell.episodes[report.iteration == cell.iterations],
                     seed=cell.seed,
                 )
             row[name] = found.mean
@@ -76,14 +119,10 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         stages = seconds_by_stage(report)
         row["rollout_cpu_seconds"] = stages.pop("rollouts")
         row["update_cpu_seconds"] = sum(stages.values())
-        row["kl"] = report.update.dual.kl
-        row["eta"] = report.update.dual.eta
-        row["gap"] = report.update.dual.gap
-        row["effective_samples"] = report.update.effective_samples
         row["samples"] = report.update.samples
-        rows.append(row)
+        rows.append({**row, **report.update.numbers()})
 
-    learner = KREPS(env, seed=cell.seed, recipe=cell.recipe, **cell.settings)
+    learner = LEARNERS[cell.learner](env, seed=cell.seed, **cell.options)
     learner.learn(cell.iterations, callback=evaluated, progress=False)
     return {"cell": cell.description(), "rows": rows}
 
@@ -105,4 +144,9 @@ def read_cell(cell: Cell, folder: Path) -> dict[str, Any] | None:
 
 
 def write_cell(cell: Cell, folder: Path, result: dict[str, Any]) -> None:
-    write_atomically(folder / f"{cell.name}.json", (json.dumps(result) + "\n").encode())
+    path = folder / f"{cell.name}.json"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot make the folder {path.parent}: {error}") from error
+    write_atomically(path, (json.dumps(result) + "\n").encode())

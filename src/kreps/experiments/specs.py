@@ -1,4 +1,4 @@
-"""What is compared in each experiment."""
+"""What is compared: tasks, methods, and which of them each figure shows."""
 
 from __future__ import annotations
 
@@ -7,51 +7,91 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
+from kreps.evaluation import EPISODES
+
+Options = Mapping[str, Any]
+
+
+def _none() -> Options:
+    return MappingProxyType({})
+
 
 @dataclass(frozen=True)
-class Method:
-    """One way to learn: a recipe of `kreps.KREPS` with some settings changed."""
-
-    recipe: str
-    settings: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
-
-
-@dataclass(frozen=True)
-class Experiment:
-    """Methods on one task by one protocol.
+class Task:
+    """One task and its protocol.
 
     Attributes:
         environment: Gymnasium name.
         iterations: policy updates of each trial.
-        methods: by the name that figures and tables show.
+        exploration: options of every learner that explores by itself.
+        ranges: of the grid of states, for the learner that has one.
+        episodes: of the evaluation after each update; the last policy is evaluated in full.
     """
 
     environment: str
     iterations: int
-    methods: Mapping[str, Method]
+    exploration: Options = field(default_factory=_none)
+    ranges: tuple[tuple[float, float], ...] | None = None
+    episodes: int = 50
 
 
-EXPERIMENTS: dict[str, Experiment] = {
-    "swing-up": Experiment(
-        environment="kreps/SwingUp-v0",
-        iterations=20,
-        methods={
-            "kreps (default)": Method("default"),
-            "paper-like": Method("paper"),
-        },
+TASKS: dict[str, Task] = {
+    # first policy as in the paper: N(0, 0.5^2) N m, here in units of half the range
+    "reaching": Task(
+        "kreps/Reaching-v0",
+        15,
+        {"exploration": "gaussian", "exploration_scale": 0.05},
+        ranges=((-4.0, 4.0), (-4.0, 4.0), (-8.0, 8.0), (-8.0, 8.0)),
     ),
-    # the paper's first policy on this task, N(0, 0.5^2) N m, in units of half the range
-    "reaching": Experiment(
-        environment="kreps/Reaching-v0",
-        iterations=15,
-        methods={
-            "kreps (default)": Method(
-                "default", {"exploration": "gaussian", "exploration_scale": 0.05}
-            ),
-            "sample model": Method(
-                "default",
-                {"model": "sample", "exploration": "gaussian", "exploration_scale": 0.05},
-            ),
-        },
+    "swing-up": Task(
+        "kreps/SwingUp-v0", 20, ranges=((-2.0, 5.0), (-12.0, 12.0)), episodes=EPISODES
     ),
+    "images": Task("kreps/ImageSwingUp-v0", 20),
 }
+
+
+@dataclass(frozen=True)
+class Method:
+    """One way to learn.
+
+    Attributes:
+        learner: a name of `kreps.learner.LEARNERS`.
+        options: of its constructor that make it this method.
+        tuned: whether the outcome of the parameter search applies.
+        once: it needs one iteration only, as its data does not come from its policy.
+    """
+
+    learner: str
+    options: Options = field(default_factory=_none)
+    tuned: bool = True
+    once: bool = False
+
+
+METHODS: dict[str, Method] = {
+    "kernel REPS": Method("reps"),
+    "REPS, sample model": Method("reps", {"model": "sample"}),
+    "REPS, RBF grid": Method("reps", {"features": "grid"}),
+    "value iteration": Method("value-iteration"),
+    "value iteration on a grid (simulator set to any state)": Method(
+        "grid-value-iteration", once=True
+    ),
+    "NPALP": Method("npalp"),
+    "kreps (default)": Method("reps", tuned=False),
+    "paper-like": Method("reps", {"recipe": "paper"}, tuned=False),
+}
+
+_KERNEL, _SAMPLE, _FEATURES, _VALUES, _GRID, _NPALP, _DEFAULT, _PAPER = METHODS
+
+Curve = tuple[str, str]
+"""A task and a method."""
+
+FIGURES: dict[str, tuple[Curve, ...]] = {
+    # Feature-based REPS needs a grid over the state space: left out on reaching, as in the paper.
+    "figure-1a": tuple(("reaching", m) for m in (_KERNEL, _SAMPLE, _NPALP, _VALUES, _GRID)),
+    # NPALP is for deterministic tasks: left out on the swing-up, as in the paper.
+    "figure-1b": tuple(("swing-up", m) for m in (_KERNEL, _SAMPLE, _FEATURES, _VALUES, _GRID)),
+    "figure-2b": (("images", _KERNEL), ("images", _SAMPLE), ("swing-up", _KERNEL)),
+    "swing-up": tuple(("swing-up", m) for m in (_DEFAULT, _PAPER)),
+}
+PICTURES = ("figure-2a",)
+"""Figures without an experiment: the features of the images."""

@@ -1,0 +1,39 @@
+"""Where cells run: processes of this machine, or a Dask cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing import get_context
+
+from kreps.errors import ConfigurationError
+
+
+@contextmanager
+def executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
+    """An executor of ``workers`` processes, or that of the Dask scheduler at an address.
+
+    Raises:
+        ConfigurationError: Dask is not installed, or nothing answers at the address.
+    """
+    if scheduler is None:
+        with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+            yield pool
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ConfigurationError(
+            f"--scheduler {scheduler} needs Dask, which is not installed: "
+            'pip install "kreps[cluster]"'
+        ) from error
+    try:
+        client = Client(scheduler, timeout=20)
+    except (OSError, ValueError) as error:
+        raise ConfigurationError(
+            f"no Dask scheduler answers at {scheduler!r} ({error}); start one with "
+            "`dask scheduler` and `dask worker ADDRESS`, in an environment where kreps is installed"
+        ) from error
+    with client:
+        yield client.get_executor(pure=False)

@@ -1,0 +1,171 @@
+"""Result files of a figure: every row, a summary, a table and the picture."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from kreps.envs.image_swing_up import PIXELS
+from kreps.envs.references import REFERENCE_REWARDS
+from kreps.envs.swing_up import TIME_STEP
+from kreps.experiments.specs import FIGURES, TASKS
+from kreps.policies import BangBang
+from kreps.rollout import simulate, task_of
+from kreps.runs import versions
+from kreps.seeding import Purpose, generator, integer_seed
+from kreps.storage import write_atomically
+
+
+def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """One row per method, seed and iteration."""
+    return [row for result in results for row in result["rows"]]
+
+
+def commits_of(results: Sequence[Mapping[str, Any]]) -> str:
+    """The commits at which the cells were run: one, if all went well."""
+    return ", ".join(sorted({result["commit"] for result in results}))
+
+
+def curve_name(row: Mapping[str, Any], several_tasks: bool) -> str:
+    """What a figure calls the curve that a row belongs to."""
+    return f"{row['method']}, {row['task']}" if several_tasks else str(row["method"])
+
+
+def named_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The rows with their curve's name as ``method``: it names the task where there are several."""
+    several = len({row["task"] for row in rows}) > 1
+    return [{**row, "method": curve_name(row, several)} for row in rows]
+
+
+def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Per curve, at its last iteration: mean, twice the standard error and worst seed."""
+    rows = named_rows(rows)
+    summary = {}
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row for row in rows if row["method"] == method]
+        last = [row for row in mine if row["iteration"] == max(r["iteration"] for r in mine)]
+        entry: dict[str, Any] = {
+            "trials": len(last),
+            "iteration": last[0]["iteration"],
+            "mean_steps": float(np.mean([row["steps"] for row in last])),
+            "mean_update_cpu_seconds": float(np.mean([row["update_cpu_seconds"] for row in mine])),
+        }
+        for name in ("stochastic", "greedy"):
+            values = np.array([row[name] for row in last])
+            error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+            entry[name] = {
+                "mean": float(values.mean()),
+                "two_standard_errors": float(2 * error),
+                "worst": float(values.min()),
+                "by_seed": [round(float(value), 4) for value in values],
+            }
+        summary[method] = entry
+    return summary
+
+
+def write_results(
+    folder: Path, name: str, command: str, results: Sequence[Mapping[str, Any]]
+) -> dict[str, dict[str, Any]]:
+    """``NAME.csv`` with every row, ``NAME.json`` with summary, command and commit, ``NAME.md``."""
+    rows = rows_of(results)
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n", restval="")
+    writer.writeheader()
+    writer.writerows(
+        {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in r.items()} for r in rows
+    )
+    write_atomically(folder / f"{name}.csv", text.getvalue().encode())
+    summary = summarise(rows)
+    cells = [result["cell"] for result in results]
+    content = {
+        "command": command,
+        "commit": commits_of(results),
+        "options": {f"{cell['task']}: {cell['method']}": cell["options"] for cell in cells},
+        "versions": versions(),
+        "summary": summary,
+    }
+    write_atomically(folder / f"{name}.json", (json.dumps(content, indent=2) + "\n").encode())
+    write_atomically(folder / f"{name}.md", (markdown_table(summary) + "\n").encode())
+    return summary
+
+
+TABLE_HEADINGS = ("method", "stochastic policy", "worst seed", "greedy policy", "worst seed")
+
+
+def table_rows(summary: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
+    """The summary in words: a row per method under `TABLE_HEADINGS`."""
+    largest = max(abs(entry["greedy"]["mean"]) for entry in summary.values())
+    places = 2 if largest >= 1.0 else 3
+    rows = []
+    for method, entry in summary.items():
+        row = [method]
+        for name in ("stochastic", "greedy"):
+            mean, error = entry[name]["mean"], entry[name]["two_standard_errors"]
+            row.append(f"{mean:.{places}f} ± {error:.{places}f}")
+            row.append(f"{entry[name]['worst']:.{places}f}")
+        rows.append(row)
+    return rows
+
+
+def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
+    """The summary as the documentation shows it, with the CPU seconds of an update."""
+    headings = [*TABLE_HEADINGS, "CPU s / update"]
+    rows = [
+        [*row, f"{entry['mean_update_cpu_seconds']:.2f}"]
+        for row, entry in zip(table_rows(summary), summary.values(), strict=True)
+    ]
+    lines = [f"| {' | '.join(cells)} |" for cells in (headings, *rows)]
+    return "\n".join([lines[0], "|---" * len(headings) + "|", *lines[1:]])
+
+
+TITLES = {
+    "figure-1a": "Reaching: learning progress of the methods (Fig. 1a)",
+    "figure-1b": "Swing-up: learning progress of the methods (Fig. 1b)",
+    "figure-2b": "Swing-up from images and from joint values (Fig. 2b)",
+    "swing-up": "kreps/SwingUp-v0: every seed",
+}
+
+
+def write_figure(
+    folder: Path, name: str, command: str, results: Sequence[Mapping[str, Any]]
+) -> list[Path]:
+    """The result files of a figure, and its picture."""
+    from kreps import plotting
+
+    write_results(folder, name, command, results)
+    rows = named_rows(rows_of(results))
+    environment = TASKS[FIGURES[name][0][0]].environment.replace("Image", "")
+    draw = plotting.comparison if name == "swing-up" else plotting.learning_curves
+    figure = draw(
+        rows,
+        REFERENCE_REWARDS[environment],
+        TITLES[name],
+        f"{command}   (commit {commits_of(results)})",
+    )
+    picture = plotting.save(figure, folder / f"{name}.png")
+    return [folder / f"{name}.{ending}" for ending in ("csv", "json", "md")] + [picture]
+
+
+def draw_features(path: Path) -> Path:
+    """Fig. 2a: what the learner sees of a roll-out of its first policy."""
+    from kreps import plotting
+
+    env = gym.make("kreps/ImageSwingUp-v0")
+    task = task_of(env)
+    seeds = [integer_seed(0, Purpose.ENVIRONMENT, 0, 0)]
+    noise = [generator(0, Purpose.POLICY, 0, 0)]
+    (rollout,) = simulate(env, task, BangBang(task), seeds, noise, [41])
+    shown = np.arange(1, 41, 5)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure = plotting.image_features(
+        rollout.observations[shown], [float(t * TIME_STEP) for t in shown], PIXELS
+    )
+    return plotting.save(figure, path)

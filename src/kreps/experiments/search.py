@@ -1,0 +1,168 @@
+"""The parameter search that every compared method gets, on seeds that no figure uses.
+
+Each method on each task has the same number of candidates, written down here before any was
+run, the first being its defaults.  Each is learnt on the same seeds; what counts is the evaluated
+reward of the policy with its exploration, averaged over the last updates and the seeds.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kreps.experiments.cells import Cell, cell_of
+from kreps.experiments.specs import METHODS
+from kreps.storage import write_atomically
+
+SEEDS = (200, 201)
+ITERATIONS = 10
+COUNTED = 5
+"""Updates, from the last one back, over which the reward is averaged."""
+
+EPISODES = 20
+"""Of each evaluation."""
+
+_REPS: tuple[dict[str, Any], ...] = (
+    {},
+    {"recipe": "paper"},
+    {"kl_bound": 0.5},
+    {"ridge": 0.01},
+    {"ridge": 1.0},
+    {"kl_bound": 0.5, "ridge": 0.01, "eta_floor": 0.02},
+)
+_VALUE_ITERATION: tuple[dict[str, Any], ...] = (
+    {},
+    {"temperature": 0.3},
+    {"temperature": 0.1},
+    {"temperature": 0.03},
+    {"temperature": 0.3, "actions": 9},
+    {"temperature": 0.1, "actions": 9},
+)
+
+
+def _grids(*sizes: tuple[int, int]) -> tuple[dict[str, Any], ...]:
+    return tuple({"grid_states": states, "grid_actions": actions} for states, actions in sizes)
+
+
+CANDIDATES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
+    "reaching": {
+        "kernel REPS": _REPS,
+        "REPS, sample model": _REPS,
+        "value iteration": _VALUE_ITERATION,
+        "value iteration on a grid (simulator set to any state)": _grids(
+            (4, 3), (3, 3), (3, 5), (3, 7), (4, 4), (5, 3)
+        ),
+        "NPALP": (
+            {},
+            {"lipschitz": 3.0},
+            {"lipschitz": 30.0},
+            {"lipschitz": 100.0},
+            {"lipschitz": 30.0, "noise_scale": 0.1},
+            {"lipschitz": 30.0, "noise_scale": 0.1, "noise_fraction": 1.0},
+        ),
+    },
+    "swing-up": {
+        "kernel REPS": _REPS,
+        "REPS, sample model": _REPS,
+        "REPS, RBF grid": (
+            {},
+            {"recipe": "paper"},
+            {"kl_bound": 0.5},
+            {"ridge": 0.01},
+            {"grid_size": 7},
+            {"grid_size": 15},
+        ),
+        "value iteration": _VALUE_ITERATION,
+        "value iteration on a grid (simulator set to any state)": _grids(
+            (15, 7), (10, 7), (20, 5), (25, 5), (20, 9), (30, 3)
+        ),
+    },
+    "images": {
+        "kernel REPS": _REPS,
+        "REPS, sample model": _REPS,
+    },
+}
+
+
+def search_cells(task: str, method: str) -> list[list[Cell]]:
+    """The cells of each candidate."""
+    return [
+        [
+            cell_of(
+                task,
+                method,
+                seed,
+                options,
+                iterations=ITERATIONS,
+                episodes=(EPISODES, EPISODES),
+                label=f"candidate {number}",
+            )
+            for seed in SEEDS
+        ]
+        for number, options in enumerate(CANDIDATES[task][method])
+    ]
+
+
+def score(rows: Sequence[Mapping[str, Any]]) -> float:
+    """The average of what counts over the rows of one cell."""
+    return float(np.mean([row["stochastic"] for row in rows[-COUNTED:]]))
+
+
+def outcome(task: str, method: str, results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """What the search of one method on one task found.
+
+    Args:
+        task, method: names.
+        results: of the cells, by their names.
+    """
+    scores = [
+        [round(score(results[cell.name]["rows"]), 4) for cell in cells]
+        for cells in search_cells(task, method)
+    ]
+    best = int(np.argmax([np.mean(each) for each in scores]))
+    candidates = CANDIDATES[task][method]
+    return {
+        "candidates": [
+            {"options": options, "scores": each}
+            for options, each in zip(candidates, scores, strict=True)
+        ],
+        "chosen": candidates[best],
+    }
+
+
+def write_search(
+    path: Path, command: str, tasks: Sequence[str], results: Sequence[Mapping[str, Any]]
+) -> Path:
+    """The outcome of the search on some tasks, beside what the file says of the others."""
+    by_name = {Cell(**result["cell"]).name: result for result in results}
+    try:
+        found = json.loads(path.read_text())["outcome"]
+    except FileNotFoundError:
+        found = {}
+    for task in tasks:
+        found[task] = {m: outcome(task, m, by_name) for m in CANDIDATES[task]}
+    commits = sorted({result["commit"] for result in results})
+    content = {
+        "command": command,
+        "commit": ", ".join(commits),
+        "seeds": SEEDS,
+        "iterations": ITERATIONS,
+        "score": f"evaluated reward with exploration, mean of the last {COUNTED} iterations",
+        "outcome": found,
+    }
+    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
+    return path
+
+
+def tuned_options(task: str, method: str) -> dict[str, Any]:
+    """What the search chose, from the file of its outcome; the defaults where it chose nothing."""
+    if not METHODS[method].tuned:
+        return {}
+    file = resources.files("kreps.experiments").joinpath("search.json")
+    found = json.loads(file.read_text())["outcome"] if file.is_file() else {}
+    return dict(found.get(task, {}).get(method, {}).get("chosen", {}))
