@@ -4,31 +4,40 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
-from kreps.errors import StorageError
-from kreps.experiments import cells as cells_module
-from kreps.experiments.cells import Cell, read_cell, run_cell, write_cell
-from kreps.experiments.runner import (
-    cells_of,
+from kreps.errors import ConfigurationError, StorageError
+from kreps.experiments import claims, search
+from kreps.experiments.cells import Cell, cell_of, read_cell, run_cell, write_cell
+from kreps.experiments.claims import CLAIMS, Claim, judge, verdict, write_claims
+from kreps.experiments.executors import executor
+from kreps.experiments.figures import (
     commits_of,
+    draw_features,
     markdown_table,
+    named_rows,
     rows_of,
-    run_cells,
     summarise,
+    write_figure,
     write_results,
 )
-from kreps.experiments.specs import EXPERIMENTS, Experiment, Method
+from kreps.experiments.runner import figure_cells, name_of, run_cells
+from kreps.experiments.specs import FIGURES, METHODS, TASKS
+from kreps.learner import LEARNERS
 
 TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
-EXPERIMENT = Experiment(
-    "kreps/SwingUp-v0", 2, {"One": Method("default", TINY), "the other": Method("paper", TINY)}
-)
+
+
+def tiny(seed: int, method: str = "kernel REPS", **options: Any) -> Cell:
+    """A cell that takes a moment."""
+    return cell_of("swing-up", method, seed, {**TINY, **options}, iterations=2, episodes=(3, 5))
 
 
 class Inline(Executor):
@@ -48,18 +57,8 @@ class Inline(Executor):
         return future
 
 
-@pytest.fixture(autouse=True)
-def short_evaluations(monkeypatch: pytest.MonkeyPatch) -> None:
-    full = cells_module.evaluate
-
-    def short(*args: Any, **kwargs: Any) -> Any:
-        return full(*args, **kwargs, episodes=5, steps=30)
-
-    monkeypatch.setattr(cells_module, "evaluate", short)
-
-
-def test_cells_are_each_method_with_each_seed_from_zero() -> None:
-    cells = cells_of(EXPERIMENTS["swing-up"], 3, None)
+def test_cells_are_each_curve_with_each_seed_from_zero() -> None:
+    cells = figure_cells("swing-up", 3, None)
     assert [(c.method, c.seed) for c in cells] == [
         (method, seed) for seed in range(3) for method in ("kreps (default)", "paper-like")
     ]
@@ -67,8 +66,26 @@ def test_cells_are_each_method_with_each_seed_from_zero() -> None:
     assert len({c.name for c in cells}) == len(cells)
 
 
+def test_the_figures_show_what_the_paper_shows() -> None:
+    of = {name: {method for _, method in curves} for name, curves in FIGURES.items()}
+    assert not {"REPS, RBF grid"} & of["figure-1a"]  # no grid over a six-dimensional space
+    assert "NPALP" in of["figure-1a"]
+    assert "NPALP" not in of["figure-1b"]  # for deterministic tasks only
+    assert len(of["figure-1a"]) == len(of["figure-1b"]) == 5
+    shared = {c.name for c in figure_cells("figure-1b", 2, None)}
+    assert shared & {c.name for c in figure_cells("figure-2b", 2, None)}  # run once, shown twice
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_takes_its_options(task: str, method: str) -> None:
+    cell = cell_of(task, method, 0, {}, iterations=None, episodes=(2, 2))
+    env = gym.make(cell.environment)
+    LEARNERS[cell.learner](env, seed=0, **cell.options)
+
+
 def test_a_cell_evaluates_every_iteration_and_repeats_exactly() -> None:
-    cell = cells_of(EXPERIMENT, 1, None)[0]
+    cell = tiny(0)
     result = run_cell(cell)
     assert [row["iteration"] for row in result["rows"]] == [1, 2]
     steps = [row["steps"] for row in result["rows"]]
@@ -79,38 +96,187 @@ def test_a_cell_evaluates_every_iteration_and_repeats_exactly() -> None:
 
 
 def test_what_is_done_is_never_run_again(tmp_path: Path) -> None:
-    cells = cells_of(EXPERIMENT, 2, 1)
+    cells = [tiny(seed, method) for seed in (0, 1) for method in ("kernel REPS", "NPALP")]
     broken = Inline(fail_at=2)
     with pytest.raises(RuntimeError, match="power"):
         run_cells(cells, broken, tmp_path)
     done = [cell for cell in cells if read_cell(cell, tmp_path)]
     assert len(done) == len(cells) - 1
     rest = Inline()
-    results = run_cells(cells, rest, tmp_path)
+    results = run_cells([*cells, cells[0]], rest, tmp_path)
     assert rest.calls == 1
-    assert [r["cell"]["seed"] for r in results] == [c.seed for c in cells]
+    assert [name_of(r) for r in results] == [c.name for c in cells]
     idle = Inline()
     assert run_cells(cells, idle, tmp_path) == results
     assert idle.calls == 0
 
 
 def test_a_cell_of_other_settings_is_run_again_and_a_damaged_one_is_named(tmp_path: Path) -> None:
-    cell = cells_of(EXPERIMENT, 1, 1)[0]
+    cell = tiny(0)
     write_cell(cell, tmp_path, {"commit": "x", **run_cell(cell)})
     assert read_cell(cell, tmp_path) is not None
-    other = Cell(cell.method, cell.recipe, {"kl_bound": 0.1}, cell.environment, 1, cell.seed)
-    assert read_cell(other, tmp_path) is None
+    assert read_cell(tiny(0, kl_bound=0.1), tmp_path) is None
     (tmp_path / f"{cell.name}.json").write_text("{")
     with pytest.raises(StorageError, match=cell.name):
         read_cell(cell, tmp_path)
+
+
+# ---- the search -------------------------------------------------------------------------------
+
+
+def test_every_method_has_as_many_candidates_on_seeds_that_no_figure_uses() -> None:
+    sizes = {len(each) for of_task in search.CANDIDATES.values() for each in of_task.values()}
+    assert len(sizes) == 1
+    assert min(search.SEEDS) >= 100
+    for task, curves in ((t, c) for c in FIGURES.values() for t, _ in c):
+        for curve_task, method in curves:
+            if METHODS[method].tuned and curve_task == task:
+                assert method in search.CANDIDATES[task]
+
+
+def test_the_search_takes_the_candidate_of_the_best_mean(monkeypatch: pytest.MonkeyPatch) -> None:
+    cells = search.search_cells("reaching", "NPALP")
+    assert len({cell.name for of in cells for cell in of}) == len(cells) * len(search.SEEDS)
+    rewards = np.random.default_rng(0).normal(size=(len(cells), len(search.SEEDS)))
+    rewards[3] = (5.0, -1.0)
+    rewards[4] = (1.0, 2.0)
+    results = {
+        cell.name: {"rows": [{"stochastic": -99.0}, *[{"stochastic": r}] * search.COUNTED]}
+        for of_candidate, of_seeds in zip(cells, rewards, strict=True)
+        for cell, r in zip(of_candidate, of_seeds, strict=True)
+    }
+    found = search.outcome("reaching", "NPALP", results)
+    assert found["chosen"] == search.CANDIDATES["reaching"]["NPALP"][3]
+    assert found["candidates"][4]["scores"] == [1.0, 2.0]
+
+
+def test_the_committed_search_is_of_the_candidates_of_today() -> None:
+    file = Path(search.__file__).with_name("search.json")
+    content = json.loads(file.read_text())
+    assert content["seeds"] == list(search.SEEDS)
+    assert not content["commit"].endswith("+")
+    for task, methods in search.CANDIDATES.items():
+        for method, candidates in methods.items():
+            found = content["outcome"][task][method]
+            assert [c["options"] for c in found["candidates"]] == list(candidates)
+            means = [np.mean(c["scores"]) for c in found["candidates"]]
+            assert found["chosen"] == candidates[int(np.argmax(means))]
+            assert search.tuned_options(task, method) == found["chosen"]
+    assert search.tuned_options("swing-up", "kreps (default)") == {}
+
+
+# ---- claims -----------------------------------------------------------------------------------
+
+
+def rows_with(curve: str, values: Sequence[float], task: str = "reaching") -> list[dict[str, str]]:
+    return [
+        {
+            "task": task,
+            "method": curve,
+            "seed": str(seed),
+            "iteration": str(iteration),
+            "stochastic": str(value + 0.001 * iteration),
+            "greedy": str(value),
+        }
+        for seed, value in enumerate(values)
+        for iteration in range(1, 11)
+    ]
+
+
+def test_a_claim_is_judged_by_the_interval_of_the_difference() -> None:
+    rng = np.random.default_rng(1)
+    good, bad = rng.normal(1.0, 0.5, 10), rng.normal(0.0, 0.5, 10)
+    rows = [*rows_with("A", good.tolist()), *rows_with("B", bad.tolist())]
+    found = judge(Claim("A is better", "x", "A", "B", claims.late), rows)
+    assert found is not None
+    assert found["effect"] == pytest.approx(good.mean() - bad.mean(), abs=1e-4)
+    # the percentile bootstrap of a difference of means is close to the normal interval
+    width = 1.96 * np.sqrt(good.var() / 10 + bad.var() / 10)
+    assert found["high"] - found["low"] == pytest.approx(2 * width, rel=0.1)
+    assert found["verdict"] == "confirmed"
+    against = judge(Claim("B is better", "x", "B", "A", claims.late), rows)
+    assert against is not None
+    assert against["verdict"] == "contradicted"
+    assert judge(Claim("nobody", "x", "A", "C", claims.late), rows) is None
+
+
+def test_verdicts() -> None:
+    assert verdict(0.1, 1.0, None) == "confirmed"
+    assert verdict(-1.0, -0.1, None) == "contradicted"
+    assert verdict(-0.1, 0.1, None) == "not separated"
+    assert verdict(-0.1, 0.1, 0.2) == "confirmed"
+    assert verdict(0.3, 0.5, 0.2) == "contradicted"
+    assert verdict(-0.1, 0.5, 0.2) == "not separated"
+
+
+def test_measures() -> None:
+    rows = [{"stochastic": str(v), "greedy": str(v + 1)} for v in (0, 1, 2, 3, 9, 5, 7, 6, 8, 8)]
+    assert claims.early(rows) == 1.5
+    assert claims.late(rows) == pytest.approx((5 + 7 + 6 + 8 + 8) / 5)
+    assert claims.late_greedy(rows) == pytest.approx(claims.late(rows) + 1)
+    assert claims.progress(rows) == pytest.approx(claims.late(rows) - 1.5)
+    assert claims.steadiness(rows) == pytest.approx(-1.0 / 4)
+
+
+def test_claims_name_curves_that_their_figures_show() -> None:
+    for claim in CLAIMS:
+        curves = FIGURES[claim.figure]
+        several = len({task for task, _ in curves}) > 1
+        shown = {f"{method}, {task}" if several else method for task, method in curves}
+        assert {claim.better, claim.worse} <= shown
+
+
+def test_claims_are_written_from_result_files(tmp_path: Path) -> None:
+    assert write_claims(tmp_path) == []
+    rows = [*rows_with("kernel REPS", [-0.2, -0.3]), *rows_with("NPALP", [-0.5, -0.4])]
+    with open(tmp_path / "figure-1a.csv", "w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    assert [path.name for path in write_claims(tmp_path)] == ["claims.json", "claims.md"]
+    found = json.loads((tmp_path / "claims.json").read_text())
+    assert {"kernel REPS less NPALP", "NPALP less kernel REPS"} == {c["comparison"] for c in found}
+    assert "**confirmed**" in (tmp_path / "claims.md").read_text()
+
+
+# ---- executors --------------------------------------------------------------------------------
+
+
+def test_a_dask_cluster_runs_the_same_cells(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    cells = [tiny(0), tiny(1)]
+    here = run_cells(cells, Inline(), tmp_path / "here")
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=None
+        ) as cluster,
+        executor(1, cluster.scheduler_address) as pool,
+    ):
+        there = run_cells(cells, pool, tmp_path / "there")
+    for a, b in zip(here, there, strict=True):
+        assert [r["greedy"] for r in a["rows"]] == [r["greedy"] for r in b["rows"]]
+
+
+def test_a_scheduler_that_is_not_there_is_named() -> None:
+    pytest.importorskip("distributed")
+    with (
+        pytest.raises(ConfigurationError, match="nowhere"),
+        executor(1, "nowhere://127.0.0.1:1"),
+    ):
+        pass
+
+
+# ---- results ----------------------------------------------------------------------------------
 
 
 def results_of(values: dict[str, list[float]]) -> list[dict[str, Any]]:
     return [
         {
             "commit": "abc",
+            "cell": {"task": "swing-up", "method": method, "options": {}},
             "rows": [
                 {
+                    "task": "swing-up",
                     "method": method,
                     "seed": seed,
                     "iteration": iteration,
@@ -143,7 +309,7 @@ def test_the_summary_is_of_the_last_iteration_and_shows_the_worst_seed() -> None
 def test_written_results_hold_every_row_and_where_they_come_from(tmp_path: Path) -> None:
     results = results_of({"A": [-20.0, -22.0]})
     results[1]["commit"] = "def"
-    summary = write_results(tmp_path, "try", "kreps reproduce try", EXPERIMENT, results)
+    summary = write_results(tmp_path, "try", "kreps reproduce try", results)
     content = json.loads((tmp_path / "try.json").read_text())
     assert content["summary"] == json.loads(json.dumps(summary))
     assert (content["command"], content["commit"]) == ("kreps reproduce try", "abc, def")
@@ -157,3 +323,30 @@ def test_written_results_hold_every_row_and_where_they_come_from(tmp_path: Path)
         ("1", "2"),
     ]
     assert (tmp_path / "try.md").read_text().strip() == markdown_table(summary)
+
+
+def test_rows_of_several_tasks_are_named_by_both() -> None:
+    rows = [{"task": "a", "method": "m"}, {"task": "b", "method": "m"}]
+    assert [row["method"] for row in named_rows(rows)] == ["m, a", "m, b"]
+    assert [row["method"] for row in named_rows(rows[:1])] == ["m"]
+
+
+def test_a_figure_is_written_with_its_files(tmp_path: Path) -> None:
+    results = []
+    for seed in (0, 1):
+        for method, options in (
+            ("kernel REPS", TINY),
+            ("value iteration on a grid (simulator set to any state)", {"grid_states": 6}),
+        ):
+            cell = cell_of("swing-up", method, seed, options, iterations=2, episodes=(2, 2))
+            results.append({"commit": "abc", **run_cell(cell)})
+    paths = write_figure(tmp_path, "figure-1b", "a command", results)
+    assert [path.suffix for path in paths] == [".csv", ".json", ".md", ".png"]
+    assert all(path.stat().st_size > 0 for path in paths)
+    assert commits_of(results) == "abc"
+    assert len(rows_of(results)) == 6  # the grid needs one iteration only
+
+
+def test_the_features_of_the_images_are_drawn(tmp_path: Path) -> None:
+    path = draw_features(tmp_path / "new" / "figure-2a.png")
+    assert path.read_bytes()[:4] == b"\x89PNG"

@@ -50,7 +50,9 @@ class Cell:
         return f"{_slug(self.task)}/{_slug(f'{self.method} {self.label} seed {self.seed}')}"
 
     def description(self) -> dict[str, Any]:
-        return {**vars(self), "options": dict(self.options)}
+        """As it is read back from a file."""
+        plain: dict[str, Any] = json.loads(json.dumps({**vars(self), "options": {**self.options}}))
+        return plain
 
 
 def _slug(name: str) -> str:
@@ -132,7 +134,7 @@ def read_cell(cell: Cell, folder: Path) -> dict[str, Any] | None:
     path = folder / f"{cell.name}.json"
     try:
         found = json.loads(path.read_text())
-        same = found["cell"] == json.loads(json.dumps(cell.description()))
+        same = found["cell"] == cell.description()
         whole = len(found["rows"]) == cell.iterations and isinstance(found["commit"], str)
         return found if same and whole else None
     except FileNotFoundError:
