@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check format clean constraints
+.PHONY: demo test check format clean constraints tables
 
 demo: .venv/installed           ## learn the swing-up; pictures and policy in runs/demo
 	rm -rf runs/demo
@@ -32,6 +32,9 @@ format: .venv/installed
 constraints:                    ## renew constraints.txt (needs uv)
 	uv pip compile pyproject.toml --extra dev --universal --generate-hashes \
 	  --no-annotate --no-header --upgrade --quiet -o constraints.txt
+
+tables:                         ## write the tables of results/ into the pages that show them
+	$(PYTHON) docs/fill_tables.py
 
 clean:
 	rm -rf .venv runs build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis

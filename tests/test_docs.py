@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import json
 import re
+import sys
 from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from kreps.experiments.runner import markdown_table
+from kreps.experiments.claims import claims_table, write_claims
+from kreps.experiments.figures import markdown_table
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "docs"))
+from fill_tables import filled  # noqa: E402
+
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PAPER_MAP = (ROOT / "docs/paper_map.md").read_text()
 MAPPED_NAMES = sorted(set(re.findall(r"`(kreps\.[\w.]+)`", PAPER_MAP)))
@@ -51,16 +56,30 @@ def test_relative_links_lead_somewhere(page: Path) -> None:
     assert broken == []
 
 
-@pytest.mark.parametrize("page", ["README.md", "docs/results.md"])
-def test_tables_show_what_the_result_files_hold(page: str) -> None:
-    text = (ROOT / page).read_text()
-    shown = re.findall(r"<!-- results: (.+?) -->\n(.*?)\n?<!-- end of results -->", text, re.DOTALL)
-    assert shown
-    for name, table in shown:
+def tables_of(page: Path) -> list[str]:
+    return re.findall(r"<!-- results: (.+?) -->", page.read_text())
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if tables_of(p)], ids=lambda page: page.name)
+def test_tables_show_what_the_result_files_hold(page: Path) -> None:
+    text = page.read_text()
+    assert filled(text) == text
+    for name in tables_of(page):
+        table = (ROOT / "results" / f"{name}.md").read_text().strip()
         content = json.loads((ROOT / "results" / f"{name}.json").read_text())
-        assert table == markdown_table(content["summary"])
-        assert content["command"] in text
-        assert not content["commit"].endswith("+")
+        if name == "claims":
+            assert table == claims_table(content)
+        else:
+            assert table == markdown_table(content["summary"])
+            assert not content["commit"].endswith("+")
+
+
+def test_claims_are_those_of_the_result_files(tmp_path: Path) -> None:
+    for path in (ROOT / "results").glob("figure-*.csv"):
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    write_claims(tmp_path)
+    for name in ("claims.json", "claims.md"):
+        assert (tmp_path / name).read_text() == (ROOT / "results" / name).read_text()
 
 
 def test_the_public_names_exist() -> None:

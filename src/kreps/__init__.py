@@ -25,15 +25,23 @@ if TYPE_CHECKING:
     from kreps.controller import Policy, load_policy
     from kreps.data import Rollout, TaskSpec
     from kreps.envs.restart import RandomRestart
-    from kreps.learner import KREPS, IterationReport
+    from kreps.learner import (
+        KREPS,
+        NPALP,
+        GridValueIteration,
+        IterationReport,
+        ValueIteration,
+    )
     from kreps.settings import RECIPES, Settings
 
 __all__ = [
     "KREPS",
+    "NPALP",
     "RECIPES",
     "ConfigurationError",
     "DataError",
     "EnvironmentFailure",
+    "GridValueIteration",
     "IterationReport",
     "KrepsError",
     "NumericalError",
@@ -44,6 +52,7 @@ __all__ = [
     "SpaceError",
     "StorageError",
     "TaskSpec",
+    "ValueIteration",
     "load_policy",
 ]
 
@@ -53,6 +62,9 @@ __version__ = "0.1.0"
 # registered should cost little more than importing Gymnasium.
 _HOMES = {
     "KREPS": "learner",
+    "ValueIteration": "learner",
+    "GridValueIteration": "learner",
+    "NPALP": "learner",
     "IterationReport": "learner",
     "Policy": "controller",
     "load_policy": "controller",

@@ -166,10 +166,15 @@ def collect_grid(
     grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
     states, actions = np.split(grid, [task.observation_size], axis=1)
     rngs = [generator(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
-    simulated = cast(SettableModel, model).states_at(states)
-    observations = _checked(model.observe(simulated), count, task).copy()
-    simulated, rewards, ended = model.step(simulated, actions, rngs)
-    successors = _checked(model.observe(simulated), count, task)
+    try:
+        simulated = cast(SettableModel, model).states_at(states)
+        observations = _checked(model.observe(simulated), count, task).copy()
+        simulated, rewards, ended = model.step(simulated, actions, rngs)
+        successors = _checked(model.observe(simulated), count, task)
+    except DataError:
+        raise
+    except Exception as error:
+        raise _failure(error, "a grid of states", 0) from error
     return [
         Rollout(np.stack([before, after]), action[None], np.array([reward]), bool(end))
         for before, after, action, reward, end in zip(

@@ -47,12 +47,11 @@ class SoftmaxPolicy:
 
     def q_values(self, states: FloatArray) -> FloatArray:
         """Q (m, k) at states (m, ds)."""
-        parts = [
-            gaussian_gram(self._coordinates, self.kernel.embed(states[i : i + CHUNK])).T
-            @ self.table
-            for i in range(0, len(states), CHUNK)
-        ]
-        return self.offset + np.concatenate(parts)
+        q = np.empty((len(states), len(self.candidates)))
+        for i in range(0, len(states), CHUNK):
+            k = gaussian_gram(self._coordinates, self.kernel.embed(states[i : i + CHUNK]))
+            q[i : i + CHUNK] = k.T @ self.table + self.offset
+        return q
 
     def value(self, states: FloatArray) -> FloatArray:
         """V (m,) at states (m, ds): the soft maximum of Q."""
@@ -119,13 +118,16 @@ class LipschitzPolicy:
 
     def value(self, states: FloatArray) -> FloatArray:
         """V (m,) at states (m, ds)."""
-        chunks = range(0, len(states), CHUNK)
-        return np.concatenate([self._bounds_at(states[i : i + CHUNK]).max(axis=1) for i in chunks])
+        value = np.empty(len(states))
+        for i in range(0, len(states), CHUNK):
+            value[i : i + CHUNK] = self._bounds_at(states[i : i + CHUNK]).max(axis=1)
+        return value
 
     def greedy(self, states: FloatArray) -> FloatArray:
-        chunks = range(0, len(states), CHUNK)
-        chosen = [self._bounds_at(states[i : i + CHUNK]).argmax(axis=1) for i in chunks]
-        return self.actions[np.concatenate(chosen)]
+        chosen = np.empty(len(states), dtype=np.intp)
+        for i in range(0, len(states), CHUNK):
+            chosen[i : i + CHUNK] = self._bounds_at(states[i : i + CHUNK]).argmax(axis=1)
+        return self.actions[chosen]
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
         # One normal number both decides whether there is noise and, stretched back to a whole

@@ -163,6 +163,8 @@ def iterate_values(
         change = float(difference.max() - difference.min())
         values = fresh
         if change <= TOLERANCE or sweeps == MAX_SWEEPS:
+            # differences of V have settled; its level goes on by a geometric series
+            offset += float(difference.mean()) * gamma / (1.0 - gamma)
             return table, offset, sweeps, change
 
 

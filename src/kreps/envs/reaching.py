@@ -54,6 +54,12 @@ def reward(state: FloatArray, torques: FloatArray) -> FloatArray:
     return -1e-4 * np.sum(torques**2, axis=1) - np.sum(distance**2, axis=1)
 
 
+def wrap_angles(states: FloatArray) -> FloatArray:
+    """The states (m, 4), in place, with both angles in [-pi, pi)."""
+    states[:, :2] = (states[:, :2] + np.pi) % (2.0 * np.pi) - np.pi
+    return states
+
+
 class ReachingBatch:
     """The reaching task for m roll-outs at once; see `kreps.envs.batch.BatchModel`."""
 
@@ -64,7 +70,7 @@ class ReachingBatch:
         return states
 
     def states_at(self, observations: FloatArray) -> FloatArray:
-        return observations.copy()
+        return wrap_angles(observations.copy())
 
     def step(
         self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
@@ -75,8 +81,7 @@ class ReachingBatch:
             return np.concatenate([s[:, 2:], accelerations(s, torques)], axis=1)
 
         successors = runge_kutta(derivative, states, TIME_STEP, SUB_STEPS)
-        successors[:, :2] = (successors[:, :2] + np.pi) % (2.0 * np.pi) - np.pi
-        return successors, reward(states, torques), np.zeros(len(rngs), dtype=bool)
+        return wrap_angles(successors), reward(states, torques), np.zeros(len(rngs), dtype=bool)
 
 
 class Reaching(BatchEnvironment):

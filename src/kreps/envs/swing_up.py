@@ -63,7 +63,7 @@ class SwingUpBatch:
         return states
 
     def states_at(self, observations: FloatArray) -> FloatArray:
-        return observations.copy()
+        return np.stack([wrap_angle(observations[:, 0]), observations[:, 1]], axis=1)
 
     def step(
         self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]

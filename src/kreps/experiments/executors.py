@@ -29,11 +29,11 @@ def executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
             'pip install "kreps[cluster]"'
         ) from error
     try:
-        client = Client(scheduler, timeout=20)
+        client = Client(scheduler, timeout=20)  # type: ignore[no-untyped-call]
     except (OSError, ValueError) as error:
         raise ConfigurationError(
             f"no Dask scheduler answers at {scheduler!r} ({error}); start one with "
             "`dask scheduler` and `dask worker ADDRESS`, in an environment where kreps is installed"
         ) from error
     with client:
-        yield client.get_executor(pure=False)
+        yield client.get_executor(pure=False)  # type: ignore[no-untyped-call]

@@ -32,7 +32,7 @@ class Task:
     iterations: int
     exploration: Options = field(default_factory=_none)
     ranges: tuple[tuple[float, float], ...] | None = None
-    episodes: int = 50
+    episodes: int = 25
 
 
 TASKS: dict[str, Task] = {
@@ -46,7 +46,7 @@ TASKS: dict[str, Task] = {
     "swing-up": Task(
         "kreps/SwingUp-v0", 20, ranges=((-2.0, 5.0), (-12.0, 12.0)), episodes=EPISODES
     ),
-    "images": Task("kreps/ImageSwingUp-v0", 20),
+    "images": Task("kreps/ImageSwingUp-v0", 15),
 }
 
 

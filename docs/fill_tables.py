@@ -1,0 +1,32 @@
+"""Writes the tables of `results/` into the pages that show them: `make tables`.
+
+Between ``<!-- results: NAME -->`` and ``<!-- end of results -->`` a page shows results/NAME.md.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+SHOWN = re.compile(r"(<!-- results: (.+?) -->\n)(.*?)\n?(<!-- end of results -->)", re.DOTALL)
+
+
+def filled(text: str, results: Path = ROOT / "results") -> str:
+    """The text with every table that there is a result file for."""
+
+    def table(match: re.Match[str]) -> str:
+        path = results / f"{match[2]}.md"
+        content = path.read_text().strip() + "\n" if path.exists() else ""
+        return match[1] + content + match[4]
+
+    return SHOWN.sub(table, text)
+
+
+if __name__ == "__main__":
+    for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
+        before = page.read_text()
+        after = filled(before)
+        if after != before:
+            page.write_text(after)
+            print(f"filled {page.relative_to(ROOT)}")
