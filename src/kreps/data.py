@@ -32,6 +32,8 @@ class TaskSpec:
         periodic: the observation coordinates that are angles in rad (period 2 pi).
         groups: observation coordinates that share a lengthscale, such as the pixels of an image;
             a coordinate in no group has its own.
+        image_shape: (height, width) if the groups are images, each row by row from the top; then
+            every coordinate belongs to one.
     """
 
     observation_size: int
@@ -39,6 +41,7 @@ class TaskSpec:
     action_high: FloatArray
     periodic: tuple[int, ...] = ()
     groups: tuple[tuple[int, ...], ...] = ()
+    image_shape: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "action_low", np.array(self.action_low, np.float64, ndmin=1))
@@ -49,7 +52,10 @@ class TaskSpec:
             object.__setattr__(self, "observation_size", operator.index(self.observation_size))
             groups = tuple(tuple(sorted({operator.index(i) for i in g})) for g in self.groups)
             object.__setattr__(self, "groups", tuple(g for g in groups if g))
-        except TypeError as error:
+            if self.image_shape is not None:
+                height, width = (operator.index(size) for size in self.image_shape)
+                object.__setattr__(self, "image_shape", (height, width))
+        except (TypeError, ValueError) as error:
             raise ConfigurationError(
                 f"observation_size = {self.observation_size!r} and periodic = {self.periodic!r}, "
                 "but a whole number and a list of whole numbers are needed, as 3 and (0, 2)"
@@ -77,6 +83,16 @@ class TaskSpec:
             raise ConfigurationError(
                 f"the group {mixed[0]} mixes angles and other coordinates, which share no scale"
             )
+        if self.image_shape is not None:
+            height, width = self.image_shape
+            if {len(group) for group in self.groups} != {height * width} or (
+                len(grouped) != self.observation_size
+            ):
+                raise ConfigurationError(
+                    f"image_shape = {self.image_shape}, but the groups have "
+                    f"{[len(group) for group in self.groups]} of {self.observation_size} "
+                    f"coordinates; each must be an image of {height} x {width}, and all in one"
+                )
         named = (*self.periodic, *grouped)
         outside = [i for i in named if not 0 <= i < self.observation_size]
         if outside:
@@ -88,7 +104,7 @@ class TaskSpec:
     @property
     def state_factors(self) -> tuple[Factor, ...]:
         """The factors of a kernel over observations, each with one lengthscale."""
-        return factors_of(self.observation_size, self.periodic, self.groups)
+        return factors_of(self.observation_size, self.periodic, self.groups, self.image_shape)
 
     @property
     def factor_count(self) -> int:

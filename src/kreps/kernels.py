@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Protocol
 
 import numpy as np
@@ -52,13 +53,47 @@ class Periodic:
         return np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
 
 
+IMAGE_BLUR = 0.3
+"""Standard deviation of the smoothing of images, in units of their side."""
+
+
+@dataclass(frozen=True)
+class SmoothedImage:
+    """``exp(-|Gx - Gy|^2 / (2 l^2))`` over the pixels ``dims``, G a Gaussian smoothing.
+
+    Pixel by pixel, two sharp pictures of a thing differ as much when it has moved by twice its
+    width as when it has moved anywhere.  Smoothed pictures differ the more, the farther it moved.
+    """
+
+    dims: tuple[int, ...]
+    shape: tuple[int, int]
+
+    def coordinates(self, x: FloatArray) -> FloatArray:
+        rows, columns = (_smoothing(size) for size in self.shape)
+        smooth = rows @ x[:, self.dims].reshape(-1, *self.shape) @ columns.T
+        return smooth.reshape(len(x), -1)
+
+
+@cache
+def _smoothing(size: int) -> FloatArray:
+    """The matrix (size, size) that smooths a row of pixels."""
+    i = np.arange(size) / (IMAGE_BLUR * size)
+    return np.exp(-0.5 * (i[:, None] - i) ** 2)
+
+
 def factors_of(
-    dimension: int, periodic: Sequence[int] = (), groups: Sequence[Sequence[int]] = ()
+    dimension: int,
+    periodic: Sequence[int] = (),
+    groups: Sequence[Sequence[int]] = (),
+    image_shape: tuple[int, int] | None = None,
 ) -> tuple[Factor, ...]:
     """One factor per group of columns, and one per column that is in no group.
 
-    Columns named in ``periodic`` are periodic, the others squared exponential.
+    Columns named in ``periodic`` are periodic, the others squared exponential; groups are images
+    of ``image_shape``, row by row, if one is given.
     """
+    if image_shape is not None:
+        return tuple(SmoothedImage(tuple(group), image_shape) for group in groups)
     grouped = {i for group in groups for i in group}
     parts = [tuple(group) for group in groups]
     parts += [(i,) for i in range(dimension) if i not in grouped]

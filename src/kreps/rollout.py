@@ -63,6 +63,7 @@ def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec
         action_high=actions.high.ravel(),
         periodic=tuple(periodic),
         groups=tuple((env.metadata or {}).get("observation_groups", ())),
+        image_shape=(env.metadata or {}).get("observation_image_shape"),
     )
 
 

@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeVar, get_args
 
 from kreps.errors import ConfigurationError
 
-Model = Literal["embedding", "sample"]
+Model = Literal["change", "embedding", "sample"]
 Features = Literal["rkhs", "grid"]
 PolicyFit = Literal["map", "bounded"]
 Exploration = Literal["bang-bang", "gaussian"]
@@ -96,7 +96,9 @@ class Settings(OnPolicySettings):
             optimum of the dual falls to zero and the KL bound would chase noise; a floor lets the
             bound go slack instead.  0 leaves only a numerical safeguard of 1e-6.
         ridge: rho times the number of samples; the softness of the stationarity constraint.
-        model: transition model, ``"embedding"`` (Eq. 4) or ``"sample"`` (the observed successor).
+        model: transition model: ``"change"`` embeds how the features change, so that far from the
+            data the state stays; ``"embedding"`` embeds the successor itself, as printed (Eq. 4);
+            ``"sample"`` takes the observed successor.
         features: of V, ``"rkhs"`` (Eq. 3) or ``"grid"`` (fixed radial basis functions).
         grid_size: centres per coordinate of the grid.
         policy_fit: hyper-parameters of the policy by leave-one-out density, ``"map"`` with priors
@@ -107,8 +109,8 @@ class Settings(OnPolicySettings):
 
     kl_bound: float = 1.0
     eta_floor: float = 0.1
-    ridge: float = 0.1
-    model: Model = "embedding"
+    ridge: float = 0.03
+    model: Model = "change"
     features: Features = "rkhs"
     grid_size: int = 10
     policy_fit: PolicyFit = "map"
@@ -209,7 +211,9 @@ AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
 
 RECIPES: dict[str, Settings] = {
     "default": Settings(),
-    "paper": Settings(kl_bound=0.5, eta_floor=0.02, policy_fit="bounded"),
+    "paper": Settings(
+        kl_bound=0.5, eta_floor=0.02, ridge=0.1, model="embedding", policy_fit="bounded"
+    ),
 }
 """``"paper"`` follows the printed method where it is printed, with a low floor against a vanishing
 temperature (``eta_floor=0`` takes it away); docs/deviations.md says what ``"default"`` changes."""

@@ -194,6 +194,7 @@ def _task_header(task: TaskSpec) -> Header:
         "action_high": task.action_high.tolist(),
         "periodic": list(task.periodic),
         "groups": [list(group) for group in task.groups],
+        "image_shape": None if task.image_shape is None else list(task.image_shape),
     }
 
 
@@ -205,6 +206,7 @@ def _task_of(header: Header) -> TaskSpec:
         fields["action_high"],
         tuple(fields["periodic"]),
         tuple(tuple(group) for group in fields["groups"]),
+        fields["image_shape"],
     )
 
 

@@ -120,11 +120,12 @@ def update(
 
     # Eq. 4: expected features of each successor
     successors = successor_features(data, features)
+    origin = embedding_origin(data, features, settings)
     model, embedding_start = transition_model(
-        data, successors, kernel, task, settings, state.embedding_start, rng
+        data, successors - origin, kernel, task, settings, state.embedding_start, rng
     )
     clock.lap("embedding fit")
-    expected = model.expected_features(successors)
+    expected = origin + model.expected_features(successors - origin)
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
@@ -182,6 +183,16 @@ def value_basis(data: Transitions, kernel: Kernel, settings: Settings) -> tuple[
     return RKHSBasis.fit(
         kernel, data.points, tolerance=settings.basis_tolerance, max_rank=settings.max_rank
     )
+
+
+def embedding_origin(data: Transitions, features: FloatArray, settings: Settings) -> FloatArray:
+    """What the embedded features are counted from, (n, r): those of the state itself, or zero.
+
+    An embedding fades to its origin far from the data.  That the state stays is a better guess
+    there than that its features vanish, and a better one to learn corrections of.
+    """
+    own = features[data.state]
+    return np.zeros_like(own) if settings.model == "embedding" else own
 
 
 def transition_model(

@@ -76,7 +76,8 @@ class ImageSwingUp(BatchEnvironment):
     ## Observation Space
 
     The observation is a `ndarray` with shape `(800,)` and data type float64.
-    `metadata["observation_groups"]` tells that the pixels of each image belong together.
+    `metadata["observation_groups"]` tells that the pixels of each image belong together, and
+    `metadata["observation_image_shape"]` how they lie.
 
     | Num     | Observation                                          | Min | Max |
     |---------|------------------------------------------------------|-----|-----|
@@ -116,6 +117,7 @@ class ImageSwingUp(BatchEnvironment):
         "render_modes": ["rgb_array"],
         "render_fps": SwingUp.metadata["render_fps"],
         "observation_groups": (tuple(range(PIXELS**2)), tuple(range(PIXELS**2, 2 * PIXELS**2))),
+        "observation_image_shape": (PIXELS, PIXELS),
         "action_labels": SwingUp.metadata["action_labels"],
     }
     batch_model = ImageSwingUpBatch()

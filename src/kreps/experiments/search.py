@@ -32,7 +32,7 @@ _REPS: tuple[dict[str, Any], ...] = (
     {"recipe": "paper"},
     {"kl_bound": 0.5},
     {"ridge": 0.01},
-    {"ridge": 1.0},
+    {"ridge": 0.1},
     {"kl_bound": 0.5, "ridge": 0.01, "eta_floor": 0.02},
 )
 _VALUE_ITERATION: tuple[dict[str, Any], ...] = (
