@@ -502,6 +502,7 @@ def _task(observation_size: Any = 2, **changes: Any) -> dict[str, Any]:
         "action_high": [1.0],
         "periodic": [],
         "groups": [],
+        "image_shape": None,
     }
     return {**task, **changes}
 

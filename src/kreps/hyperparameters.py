@@ -54,7 +54,7 @@ class EmbeddingLoss:
         a = inverse @ self.features
         e = a / d[:, None]
         squares = np.einsum("ij,ij->i", e, e)
-        total = float(squares.sum())
+        total = max(float(squares.sum()), 1e-200)  # nothing to predict: a state that never moves
         # d total = 2 <dC, M>: de_i = -[C^-1 dC a]_i / d_i + e_i [C^-1 dC C^-1]_ii / d_i
         m = ((inverse * (squares / d)) - a @ (e / d[:, None]).T) @ inverse
         weighted = m * gram
