@@ -30,9 +30,9 @@ EPISODES = 20
 _REPS: tuple[dict[str, Any], ...] = (
     {},
     {"recipe": "paper"},
-    {"kl_bound": 0.5},
-    {"ridge": 0.01},
-    {"ridge": 0.1},
+    {"kl_bound": 0.7},
+    {"ridge": 0.03},
+    {"kl_bound": 0.7, "ridge": 0.03},
     {"kl_bound": 0.5, "ridge": 0.01, "eta_floor": 0.02},
 )
 _VALUE_ITERATION: tuple[dict[str, Any], ...] = (
@@ -72,8 +72,8 @@ CANDIDATES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
         "REPS, RBF grid": (
             {},
             {"recipe": "paper"},
-            {"kl_bound": 0.5},
-            {"ridge": 0.01},
+            {"kl_bound": 0.7},
+            {"ridge": 0.03},
             {"grid_size": 7},
             {"grid_size": 15},
         ),
