@@ -141,7 +141,12 @@ def test_the_search_takes_the_candidate_of_the_best_mean(monkeypatch: pytest.Mon
     rewards[3] = (5.0, -1.0)
     rewards[4] = (1.0, 2.0)
     results = {
-        cell.name: {"rows": [{"stochastic": -99.0}, *[{"stochastic": r}] * search.COUNTED]}
+        cell.name: {
+            "rows": [
+                {"stochastic": -99.0, "greedy": 0.0},
+                *[{"stochastic": r - 1.0, "greedy": r + 1.0}] * search.COUNTED,
+            ]
+        }
         for of_candidate, of_seeds in zip(cells, rewards, strict=True)
         for cell, r in zip(of_candidate, of_seeds, strict=True)
     }

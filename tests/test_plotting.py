@@ -239,7 +239,9 @@ def test_a_comparison_shows_every_seed_and_their_mean(tmp_path: Path) -> None:
         for seed in (0, 1, 2)
         for iteration in (1, 2)
     ]
-    figure = plotting.comparison(data, REFERENCES, "title", "source")
+    figure = plotting.comparison(
+        data, {"default": REFERENCES, "paper": REFERENCES}, "title", "source"
+    )
     assert len(figure.axes) == 4
     stochastic = figure.axes[0]
     curves = [line for line in stochastic.lines if len(np.asarray(line.get_xdata())) == 2]
@@ -250,4 +252,37 @@ def test_a_comparison_shows_every_seed_and_their_mean(tmp_path: Path) -> None:
         assert any(name in a.get_title(loc="left") + a.get_title() for a in figure.axes)
     plotting.save(figure, tmp_path / "comparison.png")
     one = [row for row in data if row["seed"] == 0]
-    plotting.save(plotting.comparison(one, {}, "one seed", ""), tmp_path / "one.png")
+    plotting.save(
+        plotting.comparison(
+            one, {"default": {}, "paper": {"x": -60.0, "y": -80.0}}, "one seed", ""
+        ),
+        tmp_path / "one.png",
+    )
+
+
+def test_learning_curves_show_means_and_level_lines(tmp_path: Path) -> None:
+    data = [
+        {
+            "method": "A",
+            "seed": seed,
+            "iteration": iteration,
+            "steps": 100 * iteration + seed,
+            "training_reward": -60.0 + seed,
+            "stochastic": -50.0 + 10 * iteration + seed,
+            "greedy": -45.0 + 10 * iteration,
+        }
+        for seed in (0, 2)
+        for iteration in (1, 2)
+    ]
+    data += [{**row, "method": "once"} for row in data if row["iteration"] == 1]
+    figure = plotting.learning_curves(data, REFERENCES, "title", "source")
+    training, stochastic, greedy = figure.axes
+    of = {line.get_label(): line for line in stochastic.lines}
+    np.testing.assert_allclose(np.asarray(of["A"].get_xdata(), dtype=float), [101.0, 201.0])
+    np.testing.assert_allclose(np.asarray(of["A"].get_ydata(), dtype=float), [-39.0, -29.0])
+    in_training = {line.get_label(): line for line in training.lines}
+    np.testing.assert_allclose(np.asarray(in_training["A"].get_ydata(), dtype=float), [-59.0] * 2)
+    level = np.asarray(in_training["once, one iteration"].get_ydata(), dtype=float)
+    np.testing.assert_allclose(level, -39.0)  # evaluated: nothing was trained on
+    assert greedy.get_xlabel() == "environment steps"
+    plotting.save(figure, tmp_path / "curves.png")

@@ -292,26 +292,34 @@ def _label_axes(axes: Axes, task: TaskSpec, labels: Sequence[str]) -> None:
 
 
 def comparison(
-    rows: Sequence[Mapping[str, Any]], references: Mapping[str, float], title: str, source: str
+    rows: Sequence[Mapping[str, Any]],
+    references: Mapping[str, Mapping[str, float]],
+    title: str,
+    source: str,
 ) -> Figure:
     """Every seed of every method against environment steps, stochastic above greedy, and means.
 
     Args:
         rows: of an experiment, one per method, seed and iteration.
-        references: values to draw as lines, by name.
+        references: values to draw as lines, by name, for each method; where they differ, so do
+            the tasks, and each has a scale of its own.
         title: of the figure.
         source: command and commit that made it, printed below.
     """
     methods = list(dict.fromkeys(row["method"] for row in rows))
     with rc_context(STYLE):
         figure = Figure(figsize=(4.6 * len(methods) + 1.4, 6.4))
-        plots = figure.subplots(2, len(methods), sharex=True, sharey=True, squeeze=False)
+        one_task = all(references[m] == references[methods[0]] for m in methods)
+        plots = figure.subplots(
+            2, len(methods), sharex=True, sharey=True if one_task else "col", squeeze=False
+        )
         for column, method in enumerate(methods):
             mine = [row for row in rows if row["method"] == method]
             for axes, name in zip(plots[:, column], ("stochastic", "greedy"), strict=True):
                 _draw_seeds(axes, mine, name)
-                draw_references(axes, references, named=column == len(methods) - 1)
-                axes.set_title(f"{method}, {name} policy")
+                named = not one_task or column == len(methods) - 1
+                draw_references(axes, references[method], named=named)
+                axes.set_title(f"{method}: {name}")
         for axes in plots[:, 0]:
             axes.set_ylabel("average reward per step")
         for axes in plots[-1]:

@@ -18,3 +18,6 @@ REFERENCE_REWARDS: dict[str, dict[str, float]] = {
 }
 """From best to worst, at least two.  The lean is the local optimum in which many learners stop:
 full torque held to one side.  Tests measure all but the optima, which `benchmarks/` computes."""
+
+REFERENCE_REWARDS["kreps/ImageSwingUp-v0"] = REFERENCE_REWARDS["kreps/SwingUp-v0"]
+"""The same process seen by a camera: what full knowledge of its state reaches bounds it."""

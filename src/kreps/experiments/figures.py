@@ -15,7 +15,7 @@ import numpy as np
 from kreps.envs.image_swing_up import PIXELS
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.envs.swing_up import TIME_STEP
-from kreps.experiments.specs import FIGURES, TASKS
+from kreps.experiments.specs import TASKS
 from kreps.policies import BangBang
 from kreps.rollout import simulate, task_of
 from kreps.runs import versions
@@ -131,7 +131,9 @@ TITLES = {
     "figure-1b": "Swing-up: learning progress of the methods (Fig. 1b)",
     "figure-2b": "Swing-up from images and from joint values (Fig. 2b)",
     "swing-up": "kreps/SwingUp-v0: every seed",
+    "defaults": "One configuration, three tasks: every seed",
 }
+SEED_BY_SEED = ("swing-up", "defaults")
 
 
 def write_figure(
@@ -142,14 +144,13 @@ def write_figure(
 
     write_results(folder, name, command, results)
     rows = named_rows(rows_of(results))
-    environment = TASKS[FIGURES[name][0][0]].environment.replace("Image", "")
-    draw = plotting.comparison if name == "swing-up" else plotting.learning_curves
-    figure = draw(
-        rows,
-        REFERENCE_REWARDS[environment],
-        TITLES[name],
-        f"{command}   (commit {commits_of(results)})",
-    )
+    references = {row["method"]: REFERENCE_REWARDS[TASKS[row["task"]].environment] for row in rows}
+    source = f"{command}   (commit {commits_of(results)})"
+    if name in SEED_BY_SEED:
+        figure = plotting.comparison(rows, references, TITLES[name], source)
+    else:
+        some = next(iter(references.values()))
+        figure = plotting.learning_curves(rows, some, TITLES[name], source)
     picture = plotting.save(figure, folder / f"{name}.png")
     return [folder / f"{name}.{ending}" for ending in ("csv", "json", "md")] + [picture]
 

@@ -92,6 +92,8 @@ FIGURES: dict[str, tuple[Curve, ...]] = {
     "figure-1b": tuple(("swing-up", m) for m in (_KERNEL, _SAMPLE, _FEATURES, _VALUES, _GRID)),
     "figure-2b": (("images", _KERNEL), ("images", _SAMPLE), ("swing-up", _KERNEL)),
     "swing-up": tuple(("swing-up", m) for m in (_DEFAULT, _PAPER)),
+    # one configuration for all tasks, nothing tuned
+    "defaults": tuple((task, _DEFAULT) for task in TASKS),
 }
 PICTURES = ("figure-2a",)
 """Figures without an experiment: the features of the images."""
