@@ -259,39 +259,51 @@ show(figure, "2_kernel")
 # ## 3. The embedding: expected successors
 #
 # One observed successor says little about an action, as its noise is nearly as large as what the
-# action did. So the expectation of a function `f` of the successor is taken over *all* observed
-# successors (Eq. 4):
+# action did. So the expectation of a function `f` of the successor is taken over *all* samples, as
+# that of its change (Eq. 4, counted from the state's own value):
 #
-# `E[f(s') | s, a] = sum_i beta_i(s, a) f(s'_i)` with `beta(s, a) = (K + lambda I)^-1 k(s, a)`.
+# `E[f(s') | s, a] = f(s) + sum_i beta_i(s, a) (f(s'_i) - f(s_i))` with
+# `beta(s, a) = (K + lambda I)^-1 k(s, a)`.
 #
 # `K` holds the kernel values of all pairs of samples, now over states *and* applied actions;
 # `k(s, a)` those of the samples with the pair asked for; `lambda` is a small number that stands
 # for the noise. The strength `beta_i` says how much sample `i` counts
-# ([`KernelEmbedding.strengths`](../src/kreps/embedding.py)). The lengthscales and `lambda` are
-# fitted by predicting the features of each sample's successor from the other samples
+# ([`KernelEmbedding.strengths`](../src/kreps/embedding.py)). Far from the data all strengths fade
+# to zero, and the expectation to its origin `f(s)`: that the state stays is a better guess there
+# than that `f` vanishes, as it would without the origin
+# ([`embedding_origin`](../src/kreps/algorithms/reps.py)). The lengthscales and `lambda` are fitted
+# by predicting how the features of each sample change from the other samples
 # ([`fit_embedding`](../src/kreps/algorithms/transition_model.py)).
 #
 # Left: the strengths for the pair at the star; samples near it in state and action count. Middle:
-# the same strengths at the successors of the samples. They gather around the true density of `s'`,
-# which the learner never sees. Right: the expectations of one function, `f(s') = k(0, s')`, the
-# kernel at the goal, for all samples against the truth. The single observed values scatter widely
-# about the dashed line; the embedding has averaged most of the noise away.
+# for the same pair, how near the successor is expected to be to each position `t`, that is
+# `E[k(t, s')]`. The dotted curve is the origin, as if the state stayed; the strengths move it close
+# to the truth, which the learner never sees. Right: the expectations of one function,
+# `f(s') = k(0, s')`, the kernel at the goal, for all samples against the truth. The single observed
+# values scatter widely about the dashed line; the embedding has averaged most of the noise away.
 
 # %%
-successors = successor_features(data, features)  # F', a row phi(s'_i) per sample
-model, _ = reps.transition_model(data, successors, kernel, task, settings, None, update_rng)
+successors = successor_features(data, features)  # a row phi(s'_i) per sample
+origin = reps.embedding_origin(data, features, settings)  # a row phi(s_i) per sample
+changes = successors - origin
+model, _ = reps.transition_model(data, changes, kernel, task, settings, None, update_rng)
 assert isinstance(model, KernelEmbedding)
-expected = model.expected_features(successors)  # a row E[phi(s') | s_i, a_i] per sample
+expected = origin + model.expected_features(changes)  # a row E[phi(s') | s_i, a_i] per sample
 
 pair = np.array([[0.5, -1.0]])  # rad, rad/s
 in_units = np.column_stack([pair[:, :1], task.scaled(task.clip(pair[:, 1:]))])
 beta = model.strengths(in_units)[:, 0]
 
-after = data.points[data.successor]
 goal = np.zeros((1, 1))
 near_goal = ValueFunction(kernel, goal, np.ones(1))  # f
-observed_f = near_goal(after)
-embedded_f = model.strengths(model.inputs).T @ observed_f
+after = data.points[data.successor]
+observed_f, own_f = near_goal(after), near_goal(data.states)
+embedded_f = own_f + model.strengths(model.inputs).T @ (observed_f - own_f)
+
+# E[k(t, s')] for the pair at the star and all positions t, as function values f(s') for each t
+at_pair = kernel.gram(GRID[:, None], pair[:, :1])[:, 0]
+moved = kernel.gram(GRID[:, None], after) - kernel.gram(GRID[:, None], data.states)
+embedded_at_pair = at_pair + moved @ beta
 nodes, node_weights = np.polynomial.hermite_e.hermegauss(20)  # for expectations under the noise
 
 
@@ -308,6 +320,8 @@ def rms(error: FloatArray) -> float:
 
 
 true_f = true_expectation(near_goal)
+pair_after = pair[:, :1] + PERIOD * pair[:, 1:] + NOISE * nodes  # no need to wrap: k is periodic
+true_at_pair = kernel.gram(GRID[:, None], pair_after.T) @ node_weights / node_weights.sum()
 with rc_context(STYLE):
     figure, (left, middle, right) = panels(1, 3, 3.1, width_ratios=(1.2, 1.0, 1.0))
     top = float(np.abs(beta).max())
@@ -324,15 +338,14 @@ with rc_context(STYLE):
     action_plane(left)
     left.set_title("Strengths β for the star ...")
     figure.colorbar(dots, ax=left, pad=0.02)
-    middle.vlines(after, 0.0, beta, color=BLUE, lw=0.9)
-    away = wrap(GRID - pair[0, 0] - PERIOD * pair[0, 1])
-    density = top * np.exp(-0.5 * (away / NOISE) ** 2)
-    middle.plot(GRID, density, color=ORANGE, lw=1.6, label="true density\n(not to scale)")
+    middle.plot(GRID, at_pair, color=GREY, ls=":", label="if the state stayed")
+    middle.plot(GRID, true_at_pair, color=ORANGE, lw=1.6, label="truth")
+    middle.plot(GRID, embedded_at_pair, color=BLUE, label="embedding")
     position_axis(middle)
-    middle.set_xlabel("successor s' [rad]")
-    middle.set_ylim(top=1.35 * top)
-    middle.legend(loc="upper left", handlelength=1.0)
-    middle.set_title("... at the successors")
+    middle.set_xlabel("position t [rad]")
+    middle.set_ylim(top=1.5)
+    middle.legend(loc="upper left", handlelength=1.4)
+    middle.set_title("... and the E[k(t, s')]")
     right.axline((1.0, 1.0), slope=1.0, color=GREY, lw=0.8, ls="--")
     right.plot(
         true_f, observed_f, "o", color=ORANGE, ms=3, alpha=0.6, mew=0, label="observed f(s')"

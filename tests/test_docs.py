@@ -12,6 +12,7 @@ import pytest
 
 from kreps.experiments.claims import claims_table, write_claims
 from kreps.experiments.figures import markdown_table
+from kreps.experiments.search import search_table
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "docs"))
@@ -66,9 +67,12 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
     assert filled(text) == text
     for name in tables_of(page):
         table = (ROOT / "results" / f"{name}.md").read_text().strip()
-        content = json.loads((ROOT / "results" / f"{name}.json").read_text())
+        folder = ROOT / ("src/kreps/experiments" if name == "search" else "results")
+        content = json.loads((folder / f"{name}.json").read_text())
         if name == "claims":
             assert table == claims_table(content)
+        elif name == "search":
+            assert table == search_table(content)
         else:
             assert table == markdown_table(content["summary"])
             assert not content["commit"].endswith("+")

@@ -94,6 +94,19 @@ def test_the_strengths_average_the_noise_away(walk: Walk) -> None:
     np.testing.assert_allclose(w["expected"] @ theta, w["embedded_f"], atol=1e-3)
 
 
+def test_the_expectation_is_counted_from_that_of_the_state_itself(walk: Walk) -> None:
+    w = walk.names
+    assert w["settings"].model == "change"
+    np.testing.assert_array_equal(w["origin"], w["features"][w["data"].state])
+    np.testing.assert_allclose(w["origin"] + w["changes"], w["successors"], atol=1e-12)
+    off = [w["rms"](w[name] - w["true_at_pair"]) for name in ("embedded_at_pair", "at_pair")]
+    assert off[0] < 0.5 * off[1]
+    # the curve is the one that the features of the pair make
+    features = w["features"][w["data"].successor] - w["features"][w["data"].state]
+    expected = w["basis"].features(w["pair"][:, :1])[0] + w["beta"] @ features
+    np.testing.assert_allclose(w["on_grid"] @ expected, w["embedded_at_pair"], atol=5e-3)
+
+
 def test_the_true_expectation_is_that_of_the_simulated_motion(shown: Walk) -> None:
     w = shown.names
     noise = w["NOISE"] * np.random.default_rng(0).standard_normal((4000, 1, 1))

@@ -20,7 +20,10 @@ import kreps.evaluation
 from kreps.algorithms import npalp, reps, value_iteration
 from kreps.experiments.search import CANDIDATES
 from kreps.experiments.specs import FIGURES, METHODS
+from kreps.kernels import IMAGE_BLUR
 from kreps.learner import LEARNERS, IterationReport, Learner
+from kreps.policies import MAX_SUPPORT
+from kreps.settings import RECIPES, Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs/methods"
@@ -38,6 +41,7 @@ HEADINGS = [
     "Parameters",
     "Choices",
 ]
+KERNEL_PAGE = (FOLDER / "kernel_reps.md").read_text()
 LEFT_TO_MAKE = ("figure-1a.png", "figure-1b.png", "figure-2b.png")
 """Pictures of results/ that need not be there yet."""
 
@@ -81,6 +85,10 @@ def figures_of(method: str) -> list[str]:
         for name, curves in FIGURES.items()
         if name.startswith("figure-") and method in {of_curve for _, of_curve in curves}
     ]
+
+
+def differ(a: object, b: object, name: str) -> bool:
+    return bool(getattr(a, name) != getattr(b, name))
 
 
 def anchor(heading: str) -> str:
@@ -209,6 +217,32 @@ def test_the_table_of_parameters_agrees_with_the_settings(page: Path) -> None:
     assert all(type(shown[name]) is type(wanted[name]) for name in wanted)
     for name, value in method.options.items():
         assert f'`{name}="{value}"`' in text
+
+
+def test_what_the_paper_recipe_changes_is_said() -> None:
+    changed = {f.name for f in fields(Settings) if differ(RECIPES["paper"], Settings(), f.name)}
+    (sentence,) = re.findall(r'^`recipe="paper"` changes (.+?);', KERNEL_PAGE, re.MULTILINE)
+    assert set(re.findall(r"`(\w+)`", sentence)) == changed
+    deviations = (ROOT / "docs/deviations.md").read_text()
+    listed = deviations.split("## What the default recipe changes")[1].split("\n## ")[0]
+    items = re.findall(
+        r'^\d\. `(\w+) = (\S+)`(?: instead of `?([\w."]+\w"?)`?)?', listed, re.MULTILINE
+    )
+    assert {name for name, *_ in items} == changed
+    assert f"in {('no', 'one', 'two', 'three', 'four', 'five')[len(changed)]} settings" in listed
+    for name, default, paper in items:
+        assert getattr(Settings(), name) == ast.literal_eval(default)
+        if paper:
+            assert getattr(RECIPES["paper"], name) == ast.literal_eval(paper)
+
+
+def test_limits_are_those_of_the_code() -> None:
+    sweeps = f"{value_iteration.MAX_SWEEPS} is the limit"
+    for name in ("value_iteration", "grid_value_iteration"):
+        assert sweeps in (FOLDER / f"{name}.md").read_text()
+    assert f"{npalp.MAX_IMPROVEMENTS} is the limit" in (FOLDER / "npalp.md").read_text()
+    assert f"more than {MAX_SUPPORT} are refused" in KERNEL_PAGE
+    assert f"smoothing of {IMAGE_BLUR:g} of their side" in KERNEL_PAGE
 
 
 # ---- metrics, and the example -----------------------------------------------------------------

@@ -160,7 +160,23 @@ def write_search(
         "outcome": found,
     }
     write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
+    write_atomically(path.with_suffix(".md"), (search_table(content) + "\n").encode())
     return path
+
+
+def search_table(content: Mapping[str, Any]) -> str:
+    """The scores of all candidates as the documentation shows them, the chosen one in bold."""
+    lines = ["| task | method | scores of the candidates | chosen |", "|---|---|---|---|"]
+    for task, methods in content["outcome"].items():
+        for method, found in methods.items():
+            means = [float(np.mean(each["scores"])) for each in found["candidates"]]
+            places = 1 if max(map(abs, means)) >= 1 else 3
+            shown = [f"{mean:.{places}f}" for mean in means]
+            best = int(np.argmax(means))
+            shown[best] = f"**{shown[best]}**"
+            options = ", ".join(f"`{k}={v!r}`" for k, v in found["chosen"].items()) or "defaults"
+            lines.append(f"| {task} | {method} | {', '.join(shown)} | {options} |")
+    return "\n".join(lines)
 
 
 def tuned_options(task: str, method: str) -> dict[str, Any]:

@@ -1,0 +1,415 @@
+"""Kernels of images, the shape of images in a task, and what the embedding is counted from."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+import kreps
+from kreps.algorithms import reps
+from kreps.algorithms.transition_model import state_kernel, successor_features
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec, Transitions
+from kreps.embedding import KernelEmbedding, SampleModel
+from kreps.envs.image_swing_up import PIXELS, image
+from kreps.errors import ConfigurationError, StorageError
+from kreps.kernels import (
+    IMAGE_BLUR,
+    Kernel,
+    SmoothedImage,
+    SquaredExponential,
+    factors_of,
+    median_lengthscales,
+    squared_distances,
+)
+from kreps.settings import Settings
+
+ALL = tuple(range(PIXELS**2))
+SMOOTHED = SmoothedImage(ALL, (PIXELS, PIXELS))
+RAW = SquaredExponential(ALL)
+DEGREES = np.arange(0, 181, 5)
+
+
+def distances_from_start(factor: SmoothedImage | SquaredExponential, start: float) -> FloatArray:
+    """Of the rod at ``start`` (rad) and turned by each of `DEGREES`; of opposite rods: one."""
+    pictures = image(start + np.deg2rad(DEGREES))
+    distances: FloatArray = np.sqrt(squared_distances(factor, pictures)[0])
+    return distances / distances[-1]
+
+
+# ---- the kernel -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shape", [(3, 5), (5, 3), (1, 6), (4, 4)])
+def test_gram_matrices_are_positive_semi_definite(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(0)
+    size = shape[0] * shape[1]
+    x = rng.normal(size=(40, 2 * size))
+    factors = factors_of(2 * size, groups=(range(size), range(size, 2 * size)), image_shape=shape)
+    kernel = Kernel(factors, median_lengthscales(factors, x, rng))
+    gram = kernel.gram(x)
+    np.testing.assert_allclose(gram, gram.T, atol=1e-12)
+    np.testing.assert_array_equal(np.diagonal(gram), 1.0)
+    assert np.linalg.eigvalsh(gram).min() > -1e-12
+    assert 0.0 <= gram.min() < 0.9
+    # the product of one Gaussian for each image
+    wanted = np.ones_like(gram)
+    for factor, lengthscale in zip(factors, kernel.lengthscales, strict=True):
+        wanted *= np.exp(-0.5 * squared_distances(factor, x) / lengthscale**2)
+    np.testing.assert_allclose(gram, wanted, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(20, 20), (7, 12), (12, 7)])
+def test_coordinates_are_those_of_an_explicit_smoothing(shape: tuple[int, int]) -> None:
+    height, width = shape
+    x = np.random.default_rng(1).normal(size=(5, height * width))
+    found = SmoothedImage(tuple(range(height * width)), shape).coordinates(x)
+    widths = (IMAGE_BLUR * height, IMAGE_BLUR * width)
+    wanted = np.stack(
+        [
+            gaussian_filter(each.reshape(shape), widths, mode="constant", truncate=30.0).ravel()
+            for each in x
+        ]
+    )
+    factor = found[0, 0] / wanted[0, 0]
+    # of a normal density on a grid of unit spacing, cut off nowhere
+    assert factor == pytest.approx(2.0 * np.pi * widths[0] * widths[1], rel=1e-6)
+    np.testing.assert_allclose(found, factor * wanted, rtol=1e-9, atol=1e-9 * np.abs(found).max())
+
+
+def test_an_image_may_lie_anywhere_among_the_coordinates() -> None:
+    rng = np.random.default_rng(2)
+    dims = tuple(range(6, 18))
+    x = rng.normal(size=(4, 20))
+    alone = SmoothedImage(tuple(range(12)), (3, 4)).coordinates(x[:, dims])
+    np.testing.assert_array_equal(SmoothedImage(dims, (3, 4)).coordinates(x), alone)
+    # rows are rows: a pixel spreads to its neighbour in the column, not to the next number
+    tall = SmoothedImage(tuple(range(20)), (10, 2)).coordinates(np.eye(20)[:1]).reshape(10, 2)
+    assert (np.diff(tall[:, 0]) < 0).all() and (tall[:, 1] < tall[:, 0]).all()
+    assert tall[1, 0] > tall[0, 1]  # one of ten rows is nearer than one of two columns
+
+
+def test_smoothing_is_linear() -> None:
+    x, y = np.random.default_rng(3).normal(size=(2, 4, PIXELS**2))
+    both = SMOOTHED.coordinates(2.0 * x - y)
+    apart = 2.0 * SMOOTHED.coordinates(x) - SMOOTHED.coordinates(y)
+    np.testing.assert_allclose(both, apart, atol=1e-9)
+
+
+# ---- distances of pictures of the rod, as docs/deviations.md has them -------------------------
+
+
+@pytest.mark.parametrize("start", np.deg2rad([0.0, 17.0, 45.0, 90.0, 133.0]))
+def test_distances_grow_with_the_angle_where_raw_ones_saturate(start: float) -> None:
+    smoothed, raw = (distances_from_start(f, start) for f in (SMOOTHED, RAW))
+    quarter = DEGREES <= 90
+    # from 60 to 90 degrees: another third, where raw pictures have nothing left to say
+    growth = {}
+    for name, distances in (("smoothed", smoothed), ("raw", raw)):
+        growth[name] = distances[DEGREES == 90].item() / distances[DEGREES == 60].item()
+    assert (np.diff(smoothed[quarter]) > 0.005).all()
+    assert growth["smoothed"] > 1.25 and growth["raw"] < 1.1
+    assert raw[DEGREES == 60].item() > 0.9 > 0.6 > smoothed[DEGREES == 60].item()
+    chord = np.sin(np.deg2rad(DEGREES) / 2.0)
+    assert np.abs(smoothed - chord).max() < 0.12 < 0.35 < np.abs(raw - chord).max()
+
+
+def test_the_shares_are_those_of_the_page() -> None:
+    at = np.isin(DEGREES, (30, 90))
+    np.testing.assert_allclose(distances_from_start(RAW, 0.0)[at], [0.65, 0.98], atol=0.006)
+    np.testing.assert_allclose(distances_from_start(SMOOTHED, 0.0)[at], [0.34, 0.75], atol=0.006)
+    page = (Path(__file__).resolve().parents[1] / "docs/deviations.md").read_text()
+    assert "| raw images | 0.65 | 0.98 |\n| smoothed images | 0.34 | 0.75 |" in page
+
+
+@pytest.mark.parametrize("velocity", [2.0, 5.0, 8.0])
+def test_difference_images_of_one_speed_are_told_apart_too(velocity: float) -> None:
+    """Raw ones are as far apart at 30 degrees as on opposite sides; smoothed ones are not."""
+    angles = np.deg2rad(np.arange(0.0, 360.0, 15.0))
+
+    def mean_distance(factor: SmoothedImage | SquaredExponential, degrees: float) -> float:
+        a, b = (
+            factor.coordinates(image(at) - image(at - 0.05 * velocity))
+            for at in (angles, angles + np.deg2rad(degrees))
+        )
+        return float(np.linalg.norm(a - b, axis=1).mean())
+
+    shares = {f: mean_distance(f, 30.0) / mean_distance(f, 180.0) for f in (RAW, SMOOTHED)}
+    assert shares[RAW] > 0.95
+    assert shares[SMOOTHED] < 0.5
+
+
+# ---- the shape of images in a task ------------------------------------------------------------
+
+
+def task_of_images(shape: Any = (2, 3), **changes: Any) -> TaskSpec:
+    fields: dict[str, Any] = {
+        "observation_size": 12,
+        "action_low": np.array([-1.0]),
+        "action_high": np.array([1.0]),
+        "groups": (tuple(range(6)), tuple(range(6, 12))),
+        "image_shape": shape,
+    }
+    return TaskSpec(**{**fields, **changes})
+
+
+def test_an_image_shape_makes_smoothed_factors() -> None:
+    task = task_of_images((np.int64(2), 3))
+    assert task.image_shape == (2, 3)
+    assert all(type(size) is int for size in task.image_shape)
+    assert task.state_factors == tuple(SmoothedImage(group, (2, 3)) for group in task.groups)
+    assert task.factor_count == len(task.state_factors) == 2
+    raw = task_of_images(None)
+    assert raw.state_factors == tuple(SquaredExponential(group) for group in task.groups)
+
+
+@pytest.mark.parametrize(
+    ("shape", "changes", "message"),
+    [
+        ((2, 2), {}, "each must be an image of 2 x 2"),
+        ((3, 4), {}, "each must be an image of 3 x 4"),
+        ((2, 3), {"groups": ()}, "all in one"),
+        ((2, 3), {"groups": (tuple(range(6)),)}, "all in one"),
+        ((2, 3), {"groups": (tuple(range(6)), tuple(range(6, 11)))}, "each must be an image"),
+        ((2, 3), {"observation_size": 13}, "all in one"),
+        ((2.5, 3), {}, "whole number"),
+        ((2, 3, 1), {}, "whole number"),
+        (6, {}, "whole number"),
+        ("ab", {}, "whole number"),
+    ],
+)
+def test_a_shape_that_does_not_fit_is_refused(
+    shape: Any, changes: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(ConfigurationError, match=message):
+        task_of_images(shape, **changes)
+
+
+def rollouts_of_images(count: int, rng: np.random.Generator) -> list[Rollout]:
+    """A bump that moves along a row of six pixels where the action pushes it, more or less."""
+    rollouts = []
+    for _ in range(count):
+        actions = rng.uniform(-1.0, 1.0, size=(8, 1))
+        steps = actions[:, 0] + 0.3 * rng.normal(size=8)
+        places = np.clip(np.concatenate([[2.5], 2.5 + np.cumsum(steps)]), 0.0, 5.0)
+        pictures = np.exp(-((places[:, None] - np.arange(6)) ** 2))
+        observations = np.concatenate([pictures, np.diff(pictures, axis=0, prepend=0.0)], axis=1)
+        rollouts.append(Rollout(observations, actions, -((places[:-1] - 2.5) ** 2)))
+    return rollouts
+
+
+@pytest.fixture(scope="module")
+def learnt() -> kreps.KREPS:
+    learner = kreps.KREPS(task_of_images((1, 6)), seed=1)
+    learner.update(rollouts_of_images(8, np.random.default_rng(4)))
+    return learner
+
+
+def test_the_shape_comes_back_from_a_policy_file(learnt: kreps.KREPS, tmp_path: Path) -> None:
+    learnt.policy.save(tmp_path / "policy")
+    again = kreps.load_policy(tmp_path / "policy").process
+    assert again.task.image_shape == (1, 6)
+    assert again.task.groups == learnt.task.groups
+    seen = rollouts_of_images(1, np.random.default_rng(5))[0].observations
+    assert learnt.state.policy is not None
+    np.testing.assert_array_equal(again.greedy(seen), learnt.state.policy.greedy(seen))
+
+
+def test_the_shape_comes_back_from_a_checkpoint(learnt: kreps.KREPS, tmp_path: Path) -> None:
+    learnt.save(tmp_path / "one")
+    again = kreps.KREPS.resume(tmp_path / "one")
+    assert again.task.image_shape == (1, 6)
+    assert again.settings == learnt.settings
+    assert again.value_function.kernel.factors == learnt.task.state_factors
+    new = rollouts_of_images(3, np.random.default_rng(6))
+    for learner in (going_on := kreps.KREPS.resume(tmp_path / "one"), again):
+        learner.update(new)
+    going_on.save(tmp_path / "two")
+    again.save(tmp_path / "three")
+    assert (tmp_path / "two").read_bytes() == (tmp_path / "three").read_bytes()
+
+
+def test_no_shape_comes_back_as_none(tmp_path: Path) -> None:
+    learner = kreps.KREPS(task_of_images(None), seed=1)
+    learner.save(tmp_path / "empty")
+    assert kreps.KREPS.resume(tmp_path / "empty").task.image_shape is None
+
+
+def test_a_shape_that_lies_is_refused_when_it_is_read(learnt: kreps.KREPS, tmp_path: Path) -> None:
+    learnt.policy.save(tmp_path / "good")
+    content = (tmp_path / "good").read_bytes()
+    for lie in (b"[1, 9]", b"[-1,6]"):
+        forged = content.replace(rb"\"image_shape\": [1, 6]", rb"\"image_shape\": " + lie)
+        assert forged != content
+        (tmp_path / "bad").write_bytes(forged)
+        with pytest.raises(StorageError, match="image_shape"):
+            kreps.load_policy(tmp_path / "bad")
+
+
+def test_the_environment_tells_the_shape() -> None:
+    learner = kreps.KREPS(gym.make("kreps/ImageSwingUp-v0"))
+    assert learner.task.image_shape == (PIXELS, PIXELS)
+    groups = learner.task.groups
+    assert learner.task.state_factors == tuple(SmoothedImage(g, (PIXELS, PIXELS)) for g in groups)
+    assert kreps.KREPS(gym.make("kreps/SwingUp-v0")).task.image_shape is None
+
+
+# ---- what the embedding is counted from -------------------------------------------------------
+
+TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
+
+
+def some_transitions(rng: np.random.Generator, far: float = 0.0) -> Transitions:
+    """Three roll-outs of random walks; the last one starts ``far`` away from the others."""
+    rollouts = []
+    for shift in (0.0, 0.0, far):
+        actions = rng.uniform(-1.0, 1.0, size=(10, 1))
+        steps = np.concatenate([actions, 0.3 * rng.normal(size=(10, 1))], axis=1)
+        observations = shift + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+        rollouts.append(Rollout(observations, actions, -np.abs(observations[:-1, 0])))
+    return Transitions.of(rollouts)
+
+
+def embedding_of(data: Transitions, regulariser: float) -> KernelEmbedding:
+    inputs = np.concatenate([data.states, TASK.scaled(TASK.clip(data.actions))], axis=1)
+    return KernelEmbedding.fit(Kernel(factors_of(3), np.ones(3)), inputs, regulariser)
+
+
+def expected(
+    data: Transitions, features: FloatArray, model: KernelEmbedding | SampleModel, name: Any
+) -> FloatArray:
+    """As `reps.update` computes it."""
+    origin = reps.embedding_origin(data, features, Settings(model=name))
+    return origin + model.expected_features(successor_features(data, features) - origin)
+
+
+@pytest.fixture
+def data() -> Transitions:
+    return some_transitions(np.random.default_rng(7))
+
+
+@pytest.fixture
+def features(data: Transitions) -> FloatArray:
+    kernel = state_kernel(data, TASK, np.random.default_rng(8))
+    return reps.value_basis(data, kernel, Settings())[1]
+
+
+def test_the_default_counts_from_the_state_and_the_paper_from_zero(
+    data: Transitions, features: FloatArray
+) -> None:
+    own = reps.embedding_origin(data, features, kreps.KREPS(TASK).settings)
+    np.testing.assert_array_equal(own, features[data.state])
+    zero = reps.embedding_origin(data, features, kreps.KREPS(TASK, recipe="paper").settings)
+    np.testing.assert_array_equal(zero, np.zeros_like(own))
+
+
+def test_where_the_features_of_states_are_zero_the_change_is_eq_4(
+    data: Transitions, features: FloatArray
+) -> None:
+    # each state is a state and a successor; here only ends of roll-outs have any features
+    only_last = np.zeros_like(features)
+    last = np.setdiff1d(data.successor, data.state)
+    only_last[last] = features[last]
+    model = embedding_of(data, 0.1)
+    found = expected(data, only_last, model, "change")
+    np.testing.assert_array_equal(found, expected(data, only_last, model, "embedding"))
+    # and that is Eq. 4 as printed
+    wanted = model.strengths(model.inputs).T @ only_last[data.successor]
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+    assert np.abs(found).max() > 0.01
+
+
+def test_the_change_is_the_sum_that_the_pages_have(data: Transitions, features: FloatArray) -> None:
+    model = embedding_of(data, 0.1)
+    own, after = features[data.state], features[data.successor]
+    wanted = own + model.strengths(model.inputs).T @ (after - own)
+    found = expected(data, features, model, "change")
+    np.testing.assert_allclose(found, wanted, atol=1e-9)
+    assert np.abs(found - expected(data, features, model, "embedding")).max() > 0.01
+
+
+@pytest.mark.parametrize("name", ["change", "embedding"])
+def test_without_regularisation_it_is_the_sample_model(
+    data: Transitions, features: FloatArray, name: str
+) -> None:
+    observed = expected(data, features, SampleModel(), name)
+    off = [
+        np.abs(expected(data, features, embedding_of(data, regulariser), name) - observed).max()
+        for regulariser in (1e-1, 1e-4, 1e-10)
+    ]
+    assert off[0] > off[1] > off[2]
+    assert off[2] < 1e-5
+
+
+def test_far_from_the_data_the_state_stays(data: Transitions, features: FloatArray) -> None:
+    model = embedding_of(data, 0.1)
+    strengths = model.strengths(np.array([[50.0, 50.0, 0.0]]))[:, 0]
+    changes = features[data.successor] - features[data.state]
+    np.testing.assert_array_equal(strengths, 0.0)
+    own = features[0]
+    np.testing.assert_array_equal(own + strengths @ changes, own)
+
+
+def test_a_sample_without_neighbours_keeps_a_share_of_its_change() -> None:
+    data = some_transitions(np.random.default_rng(9), far=50.0)
+    steps = len(data) // 3
+    alone = Transitions(
+        data.points,
+        data.state[: 2 * steps + 1],
+        data.successor[: 2 * steps + 1],
+        data.start,
+        data.actions[: 2 * steps + 1],
+        data.rewards[: 2 * steps + 1],
+        data.terminated[: 2 * steps + 1],
+    )
+    features = np.random.default_rng(10).normal(size=(len(data.points), 4))
+    own, after = features[alone.state[-1]], features[alone.successor[-1]]
+    for regulariser in (0.01, 1.0, 100.0):
+        model = embedding_of(alone, regulariser)
+        share = 1.0 / (1.0 + regulariser)
+        change = expected(alone, features, model, "change")[-1]
+        np.testing.assert_allclose(change, own + share * (after - own), atol=1e-9)
+        printed = expected(alone, features, model, "embedding")[-1]
+        np.testing.assert_allclose(printed, share * after, atol=1e-9)
+
+
+def test_the_sample_model_does_not_depend_on_the_origin(
+    data: Transitions, features: FloatArray
+) -> None:
+    observed = successor_features(data, features)
+    for name in ("sample", "change", "embedding"):
+        found = expected(data, features, SampleModel(), name)
+        np.testing.assert_allclose(found, observed, atol=1e-15 * (1.0 + np.abs(features).max()))
+
+
+def test_after_a_real_end_the_change_leads_to_the_start_states(
+    data: Transitions, features: FloatArray
+) -> None:
+    ended = Transitions(
+        data.points,
+        data.state,
+        data.successor,
+        data.start,
+        data.actions,
+        data.rewards,
+        np.arange(len(data)) % 10 == 9,
+    )
+    found = expected(ended, features, embedding_of(ended, 1e-10), "change")
+    starts = np.broadcast_to(features[data.start].mean(axis=0), (3, features.shape[1]))
+    np.testing.assert_allclose(found[ended.terminated], starts, atol=1e-5)
+
+
+def test_both_models_learn_and_differ() -> None:
+    rollouts = rollouts_of_images(8, np.random.default_rng(11))
+    values = []
+    for name in ("change", "embedding"):
+        learner = kreps.KREPS(task_of_images((1, 6)), seed=2, model=name)
+        info = learner.update(rollouts)
+        assert info.dual.converged
+        values.append(learner.value_function(rollouts[0].observations))
+    assert np.abs(values[0] - values[1]).max() > 1e-3
