@@ -355,3 +355,17 @@ def test_a_figure_is_written_with_its_files(tmp_path: Path) -> None:
 def test_the_features_of_the_images_are_drawn(tmp_path: Path) -> None:
     path = draw_features(tmp_path / "new" / "figure-2a.png")
     assert path.read_bytes()[:4] == b"\x89PNG"
+
+
+def test_cells_of_the_same_work_are_run_once(tmp_path: Path) -> None:
+    cells = [tiny(0), tiny(0, "kreps (default)"), tiny(0, kl_bound=0.5)]
+    assert cells[0].work == cells[1].work != cells[2].work
+    inline = Inline()
+    results = run_cells(cells[:2], inline, tmp_path)
+    assert inline.calls == 1
+    assert [row["method"] for row in rows_of(results)] == ["kernel REPS"] * 2 + [
+        "kreps (default)"
+    ] * 2
+    (tmp_path / f"{cells[0].name}.json").unlink()
+    assert run_cells(cells, inline, tmp_path)[:2] == results
+    assert inline.calls == 2  # only the one that differs

@@ -54,6 +54,17 @@ class Cell:
         plain: dict[str, Any] = json.loads(json.dumps({**vars(self), "options": {**self.options}}))
         return plain
 
+    @property
+    def work(self) -> str:
+        """What is to be done, whatever it is called: cells that agree in it have one result."""
+        names = ("task", "method", "label")
+        return json.dumps({k: v for k, v in self.description().items() if k not in names})
+
+    def named(self, result: Mapping[str, Any]) -> dict[str, Any]:
+        """The result of a cell of the same work as that of this one."""
+        rows = [{**row, "task": self.task, "method": self.method} for row in result["rows"]]
+        return {**result, "cell": self.description(), "rows": rows}
+
 
 def _slug(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")

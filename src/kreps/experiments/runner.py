@@ -44,6 +44,7 @@ def figure_cells(figure: str, trials: int, iterations: int | None) -> list[Cell]
 def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[dict[str, Any]]:
     """The result of each cell; what is not in the folder yet is run, and kept when it is there.
 
+    Cells of the same work under different names are run once.
     A cell that fails does not keep the others from being run; its error is raised at the end.
     """
     cells = list({cell.name: cell for cell in cells}.values())
@@ -59,18 +60,33 @@ def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[d
     with bar:
         task = bar.add_task("cells", total=len(cells), completed=len(cells) - len(left), last="")
         failures: list[Exception] = []
-        running = {executor.submit(run_cell, cell): cell for cell in left}
+        done = {cell.work: result for cell in cells if (result := results[cell.name])}
+        same: dict[str, list[Cell]] = {}
+        for cell in left:
+            same.setdefault(cell.work, []).append(cell)
+
+        def keep(work: str, fresh: Mapping[str, Any]) -> None:
+            for cell in same[work]:
+                results[cell.name] = result = cell.named(fresh)
+                write_cell(cell, folder, result)
+                bar.update(task, advance=1, last=cell.name)
+
+        for work in same.keys() & done.keys():
+            keep(work, done[work])
+        running = {
+            executor.submit(run_cell, mine[0]): work
+            for work, mine in same.items()
+            if work not in done
+        }
         try:
             for future in as_completed(running):
-                cell = running[future]
+                work = running[future]
                 try:
                     fresh = {"commit": commit(), **future.result()}
                 except Exception as error:  # the other cells are worth having all the same
                     failures.append(error)
                     continue
-                results[cell.name] = fresh
-                write_cell(cell, folder, fresh)
-                bar.update(task, advance=1, last=cell.name)
+                keep(work, fresh)
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise

@@ -32,7 +32,7 @@ class Task:
     iterations: int
     exploration: Options = field(default_factory=_none)
     ranges: tuple[tuple[float, float], ...] | None = None
-    episodes: int = 25
+    episodes: int = 10
 
 
 TASKS: dict[str, Task] = {
