@@ -358,7 +358,7 @@ def test_the_features_of_the_images_are_drawn(tmp_path: Path) -> None:
 
 
 def test_cells_of_the_same_work_are_run_once(tmp_path: Path) -> None:
-    cells = [tiny(0), tiny(0, "kreps (default)"), tiny(0, kl_bound=0.5)]
+    cells = [tiny(0), tiny(0, "kreps (default)"), tiny(1)]
     assert cells[0].work == cells[1].work != cells[2].work
     inline = Inline()
     results = run_cells(cells[:2], inline, tmp_path)
