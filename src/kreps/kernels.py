@@ -17,6 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from kreps.arrays import FloatArray
+from kreps.linalg import principal_coordinates
 
 
 class Factor(Protocol):
@@ -76,9 +77,12 @@ class SmoothedImage:
 
 @cache
 def _smoothing(size: int) -> FloatArray:
-    """The matrix (size, size) that smooths a row of pixels."""
+    """A matrix (k, size), k < size, after which rows of pixels have the distances of smoothed ones.
+
+    Smooth rows lie in few dimensions: only their coordinates there are kept.
+    """
     i = np.arange(size) / (IMAGE_BLUR * size)
-    return np.exp(-0.5 * (i[:, None] - i) ** 2)
+    return principal_coordinates(np.exp(-0.5 * (i[:, None] - i) ** 2))
 
 
 def factors_of(

@@ -88,6 +88,13 @@ def qr_factor(a: FloatArray) -> FloatArray:
     return r
 
 
+def principal_coordinates(a: FloatArray, tolerance: float = 1e-8) -> FloatArray:
+    """``B`` (k, n) with ``|B x| = |A x|`` for symmetric A (n, n), up to ``tolerance |A| |x|``."""
+    values, vectors = np.linalg.eigh(a)
+    kept = np.abs(values) > tolerance * np.abs(values).max()
+    return values[kept, None] * vectors[:, kept].T
+
+
 @dataclass(frozen=True)
 class PivotedCholesky:
     """``columns @ columns.T`` approximates the matrix; exact on the rows named by ``pivots``.
