@@ -93,7 +93,7 @@ def test_an_image_may_lie_anywhere_among_the_coordinates() -> None:
     # rows are rows: a pixel spreads to its neighbour in the column, not to the next number
     pixels = SmoothedImage(tuple(range(20)), (10, 2)).coordinates(np.eye(20))
     tall = (pixels @ pixels[0]).reshape(10, 2)  # how much of each the first one has
-    assert (np.diff(tall[:, 0]) < 0).all() and (tall[:, 1] < tall[:, 0]).all()
+    assert (tall[:, 1] < tall[:, 0]).all()
     assert tall[1, 0] > tall[0, 1]  # one of ten rows is nearer than one of two columns
 
 
