@@ -13,13 +13,20 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from kreps.errors import ConfigurationError, StorageError
+from kreps.errors import CellFailure, ConfigurationError, StorageError
 from kreps.experiments import claims, search
-from kreps.experiments.cells import Cell, cell_of, read_cell, run_cell, write_cell
-from kreps.experiments.claims import CLAIMS, Claim, judge, verdict, write_claims
+from kreps.experiments.cells import (
+    Cell,
+    cell_of,
+    commits_of,
+    name_of,
+    read_cell,
+    run_cell,
+    write_cell,
+)
+from kreps.experiments.claims import CLAIMS, Claim, Kind, judge, verdict, write_claims
 from kreps.experiments.executors import executor
 from kreps.experiments.figures import (
-    commits_of,
     draw_features,
     markdown_table,
     named_rows,
@@ -28,7 +35,7 @@ from kreps.experiments.figures import (
     write_figure,
     write_results,
 )
-from kreps.experiments.runner import figure_cells, name_of, run_cells
+from kreps.experiments.runner import figure_cells, run_cells
 from kreps.experiments.specs import FIGURES, METHODS, TASKS
 from kreps.learner import LEARNERS
 
@@ -98,7 +105,7 @@ def test_a_cell_evaluates_every_iteration_and_repeats_exactly() -> None:
 def test_what_is_done_is_never_run_again(tmp_path: Path) -> None:
     cells = [tiny(seed, method) for seed in (0, 1) for method in ("kernel REPS", "NPALP")]
     broken = Inline(fail_at=2)
-    with pytest.raises(RuntimeError, match="power"):
+    with pytest.raises(CellFailure, match=r"1 of 4 cells failed, .*power"):
         run_cells(cells, broken, tmp_path)
     done = [cell for cell in cells if read_cell(cell, tmp_path)]
     assert len(done) == len(cells) - 1
@@ -159,7 +166,7 @@ def test_the_committed_search_is_of_the_candidates_of_today() -> None:
     file = Path(search.__file__).with_name("search.json")
     content = json.loads(file.read_text())
     assert content["seeds"] == list(search.SEEDS)
-    assert not content["commit"].endswith("+")
+    assert "+" not in content["commit"]
     for task, methods in search.CANDIDATES.items():
         for method, candidates in methods.items():
             found = content["outcome"][task][method]
@@ -173,7 +180,9 @@ def test_the_committed_search_is_of_the_candidates_of_today() -> None:
 # ---- claims -----------------------------------------------------------------------------------
 
 
-def rows_with(curve: str, values: Sequence[float], task: str = "reaching") -> list[dict[str, str]]:
+def rows_with(
+    curve: str, values: Sequence[float], task: str = "reaching", iterations: int = 10
+) -> list[dict[str, str]]:
     return [
         {
             "task": task,
@@ -184,34 +193,70 @@ def rows_with(curve: str, values: Sequence[float], task: str = "reaching") -> li
             "greedy": str(value),
         }
         for seed, value in enumerate(values)
-        for iteration in range(1, 11)
+        for iteration in range(1, iterations + 1)
     ]
+
+
+def claim_of(better: str, worse: str | None, kind: Kind = Kind.BETTER, **changes: Any) -> Claim:
+    return Claim("a claim", "figure-1b", better, worse, changes.get("measure", claims.late), kind)
 
 
 def test_a_claim_is_judged_by_the_interval_of_the_difference() -> None:
     rng = np.random.default_rng(1)
     good, bad = rng.normal(1.0, 0.5, 10), rng.normal(0.0, 0.5, 10)
     rows = [*rows_with("A", good.tolist()), *rows_with("B", bad.tolist())]
-    found = judge(Claim("A is better", "x", "A", "B", claims.late), rows)
+    found = judge(claim_of("A", "B"), rows)
     assert found is not None
     assert found["effect"] == pytest.approx(good.mean() - bad.mean(), abs=1e-4)
     # the percentile bootstrap of a difference of means is close to the normal interval
     width = 1.96 * np.sqrt(good.var() / 10 + bad.var() / 10)
     assert found["high"] - found["low"] == pytest.approx(2 * width, rel=0.1)
     assert found["verdict"] == "confirmed"
-    against = judge(Claim("B is better", "x", "B", "A", claims.late), rows)
+    against = judge(claim_of("B", "A"), rows)
     assert against is not None
     assert against["verdict"] == "contradicted"
-    assert judge(Claim("nobody", "x", "A", "C", claims.late), rows) is None
+    as_good = judge(claim_of("B", "A", Kind.AS_GOOD), rows)  # within the margin of 4
+    assert as_good is not None
+    assert as_good["verdict"] == "confirmed"
+    assert judge(claim_of("A", "C"), rows) is None
 
 
-def test_verdicts() -> None:
-    assert verdict(0.1, 1.0, None) == "confirmed"
-    assert verdict(-1.0, -0.1, None) == "contradicted"
-    assert verdict(-0.1, 0.1, None) == "not separated"
-    assert verdict(-0.1, 0.1, 0.2) == "confirmed"
-    assert verdict(0.3, 0.5, 0.2) == "contradicted"
-    assert verdict(-0.1, 0.5, 0.2) == "not separated"
+def test_a_claim_may_be_of_one_curve_alone() -> None:
+    gains = judge(claim_of("A", None, measure=claims.later_gain), rows_with("A", [1.0, 2.0, 5.0]))
+    assert gains is not None
+    assert gains["effect"] == pytest.approx(0.001 * (8.0 - 7.0), abs=1e-4)
+    assert gains["comparison"] == "A"
+
+
+def test_curves_are_compared_over_the_iterations_that_both_have() -> None:
+    long = rows_with("A", [0.0, 0.0], iterations=20)
+    short = rows_with("B", [0.0, 0.0], iterations=15)
+    found = judge(claim_of("A", "B"), [*long, *short])
+    assert found is not None
+    assert found["iterations"] == 15
+    assert found["effect"] == 0.0
+    once = judge(claim_of("A", "B"), [*long, *rows_with("B", [0.0, 0.0], iterations=1)])
+    assert once is not None
+    assert once["iterations"] == 20  # one iteration is all that the other needs
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "kind", "found"),
+    [
+        (0.1, 1.0, Kind.BETTER, "confirmed"),
+        (-1.0, -0.1, Kind.BETTER, "contradicted"),
+        (-0.1, 0.1, Kind.BETTER, "not separated"),
+        (-0.1, 0.1, Kind.AS_GOOD, "confirmed"),
+        (5.0, 6.0, Kind.AS_GOOD, "confirmed"),
+        (-0.3, 0.1, Kind.AS_GOOD, "not separated"),
+        (-0.5, -0.3, Kind.AS_GOOD, "contradicted"),
+        (-0.1, 0.1, Kind.EQUAL, "confirmed"),
+        (0.3, 0.5, Kind.EQUAL, "contradicted"),
+        (-0.1, 0.5, Kind.EQUAL, "not separated"),
+    ],
+)
+def test_verdicts(low: float, high: float, kind: Kind, found: str) -> None:
+    assert verdict(low, high, kind, 0.2) == found
 
 
 def test_measures() -> None:
@@ -219,8 +264,9 @@ def test_measures() -> None:
     assert claims.early(rows) == 1.5
     assert claims.late(rows) == pytest.approx((5 + 7 + 6 + 8 + 8) / 5)
     assert claims.late_greedy(rows) == pytest.approx(claims.late(rows) + 1)
-    assert claims.progress(rows) == pytest.approx(claims.late(rows) - 1.5)
+    assert claims.later_gain(rows) == pytest.approx(claims.late(rows) - (9 + 5 + 7 + 6 + 8) / 5)
     assert claims.steadiness(rows) == pytest.approx(-1.0 / 4)
+    assert claims.whole(rows) == pytest.approx(4.9)
 
 
 def test_claims_name_curves_that_their_figures_show() -> None:
@@ -228,7 +274,7 @@ def test_claims_name_curves_that_their_figures_show() -> None:
         curves = FIGURES[claim.figure]
         several = len({task for task, _ in curves}) > 1
         shown = {f"{method}, {task}" if several else method for task, method in curves}
-        assert {claim.better, claim.worse} <= shown
+        assert {claim.better, claim.worse} <= {*shown, None}
 
 
 def test_claims_are_written_from_result_files(tmp_path: Path) -> None:
@@ -240,8 +286,11 @@ def test_claims_are_written_from_result_files(tmp_path: Path) -> None:
         writer.writerows(rows)
     assert [path.name for path in write_claims(tmp_path)] == ["claims.json", "claims.md"]
     found = json.loads((tmp_path / "claims.json").read_text())
-    assert {"kernel REPS less NPALP", "NPALP less kernel REPS"} == {c["comparison"] for c in found}
+    assert {"kernel REPS - NPALP", "NPALP - kernel REPS"} <= {c["comparison"] for c in found}
     assert "**confirmed**" in (tmp_path / "claims.md").read_text()
+    (tmp_path / "figure-1a.csv").write_text("other,columns\n1,2\n")
+    with pytest.raises(StorageError, match="figure-1a"):
+        write_claims(tmp_path)
 
 
 # ---- executors --------------------------------------------------------------------------------
@@ -306,7 +355,7 @@ def test_the_summary_is_of_the_last_iteration_and_shows_the_worst_seed() -> None
     assert summary["A"]["stochastic"]["two_standard_errors"] == pytest.approx(error)
     assert summary["A"]["greedy"]["worst"] == -29.0
     assert summary["B"]["stochastic"]["by_seed"] == [-5.0]
-    assert "| A | -24.00 ± 6.11 | -30.00 | -23.00 ± 6.11 | -29.00 | 0.50 |" in markdown_table(
+    assert "| A | -24.00 ± 6.11 | -30.00 | -23.00 ± 6.11 | -29.00 | 2 | 0.50 |" in markdown_table(
         summary
     )
 

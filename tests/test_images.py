@@ -254,6 +254,12 @@ def test_a_shape_that_lies_is_refused_when_it_is_read(learnt: kreps.KREPS, tmp_p
             kreps.load_policy(tmp_path / "bad")
 
 
+@pytest.mark.parametrize("shape", [(-1, -6), (1, 2000), (6,), "ab", (0, 6), (1.0, 6)])
+def test_impossible_shapes_are_named(shape: Any) -> None:
+    with pytest.raises(ConfigurationError, match="image_shape"):
+        TaskSpec(6, np.zeros(1), np.ones(1), groups=(range(6),), image_shape=shape)
+
+
 def test_the_environment_tells_the_shape() -> None:
     learner = kreps.KREPS(gym.make("kreps/ImageSwingUp-v0"))
     assert learner.task.image_shape == (PIXELS, PIXELS)

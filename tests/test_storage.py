@@ -326,7 +326,7 @@ def test_flipped_bytes_are_refused_or_harmless(
         b"observation,action\n1.0,2.0\n" * 40,
         pickle.dumps({"policy.states": [1.0, 2.0], "kind": "policy"}),
         b"PK\x03\x04" + bytes(range(256)) * 4,
-        b'{"kind": "policy", "version": 1}',
+        b'{"kind": "policy", "version": 2}',
         "säuberlich, aber kein Array".encode("utf-16"),
         b"\xff" * 1024,
     ],
@@ -380,7 +380,7 @@ def test_a_checkpoint_is_no_policy_and_the_other_way_round(
     assert "it is a kreps policy" in refused("checkpoint", path)
 
 
-@pytest.mark.parametrize("version", [0, 2, -1, "1", None, 1e300, [1]])
+@pytest.mark.parametrize("version", [0, 1, 3, -1, "2", None, 1e300, [2]])
 def test_another_version_is_refused_with_its_remedy(
     version: Any, files: dict[str, bytes], tmp_path: Path
 ) -> None:
@@ -459,7 +459,7 @@ def test_impossible_parameters_are_refused(
 
 def test_a_policy_that_would_answer_nan_is_refused(tmp_path: Path) -> None:
     # finite numbers all, but the distances of the states overflow
-    header = {"kind": "policy", "version": 1, "task": _task(2)}
+    header = {"kind": "policy", "version": 2, "task": _task(2)}
     tensors = {
         "policy.lengthscales": np.array([1e-200, 1e-200]),
         "policy.states": np.array([[1e150, -1e150]]),
@@ -579,7 +579,7 @@ def test_forged_headers_are_refused(text: str, files: dict[str, bytes], tmp_path
 
 def test_deeply_nested_json_is_refused(files: dict[str, bytes], tmp_path: Path) -> None:
     tensors, _ = parts(files["policy"])
-    nested = '{"kind": "policy", "version": 1, "task": ' + '{"a":' * 40_000 + "1" + "}" * 40_001
+    nested = '{"kind": "policy", "version": 2, "task": ' + '{"a":' * 40_000 + "1" + "}" * 40_001
     refused("policy", forge(tmp_path / "x", tensors, nested))
     refused("policy", raw(tmp_path / "y", b'{"a":' * 30_000 + b"1" + b"}" * 30_000))
 
@@ -612,7 +612,7 @@ def test_a_wrong_header_length_is_refused_without_an_allocation(
 def test_arrays_that_lie_about_their_place_are_refused(
     entry: dict[str, Any], tmp_path: Path
 ) -> None:
-    metadata = {"kreps": json.dumps({"kind": "policy", "version": 1, "task": _task()})}
+    metadata = {"kreps": json.dumps({"kind": "policy", "version": 2, "task": _task()})}
     header = json.dumps({"__metadata__": metadata, "policy.weights": entry}).encode()
     refused("policy", raw(tmp_path / "x", header, body=b"\0" * 8))
 
@@ -651,14 +651,14 @@ def _policy_of_size(path: Path, states: Any, lengthscale: float) -> Path:
         "policy.weights": np.ones(m),
         "policy.signal_and_noise": np.array([1.0, 0.1]),
     }
-    header = {"kind": "policy", "version": 1, "policy": "cost-sensitive-gp", "task": _task(ds)}
+    header = {"kind": "policy", "version": 2, "policy": "cost-sensitive-gp", "task": _task(ds)}
     return forge(path, tensors, {**header, "arrays": sorted(tensors)})
 
 
 def _sparse_policy(path: Path) -> Path:
     """One array of 1 GiB of zeros that takes no room on disk, and that no policy has."""
     size = 2**30
-    metadata = {"kreps": json.dumps({"kind": "policy", "version": 1, "task": _task()})}
+    metadata = {"kreps": json.dumps({"kind": "policy", "version": 2, "task": _task()})}
     entry = {"dtype": "F64", "shape": [size // 8], "data_offsets": [0, size]}
     header = json.dumps({"__metadata__": metadata, "x": entry}).encode()
     raw(path, header)

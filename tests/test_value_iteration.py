@@ -395,11 +395,9 @@ def test_many_states_at_once_are_the_same_as_one_by_one() -> None:
     ("size", "count", "levels"),
     [
         (1, 25, 25),
-        (1, 1, 2),
         (1, 2, 2),
         (2, 25, 5),
         (2, 24, 4),
-        (2, 3, 2),
         (3, 25, 2),
         (3, 27, 3),
         (3, 64, 4),
@@ -418,6 +416,13 @@ def test_candidates_are_evenly_spaced_from_limit_to_limit(
     limits = task.unscaled(found)
     np.testing.assert_array_equal(limits.min(axis=0), task.action_low)
     np.testing.assert_array_equal(limits.max(axis=0), task.action_high)
+
+
+@pytest.mark.parametrize(("size", "count"), [(1, 1), (2, 3), (12, 25)])
+def test_candidates_that_do_not_fit_are_refused(size: int, count: int) -> None:
+    task = TaskSpec(1, np.zeros(size), np.ones(size))
+    with pytest.raises(ConfigurationError, match=f"actions = {count}"):
+        candidate_actions(task, count)
 
 
 # ---- the grid ---------------------------------------------------------------------------------

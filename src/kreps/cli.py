@@ -1,4 +1,4 @@
-"""The command line: kreps train | resume | evaluate | plot | video | reproduce."""
+"""The command line: kreps train | resume | evaluate | plot | video | reproduce | search."""
 
 from __future__ import annotations
 
@@ -15,10 +15,11 @@ from rich.text import Text
 import kreps
 from kreps.errors import ConfigurationError, EnvironmentFailure, KrepsError
 from kreps.evaluation import EPISODES, STEPS
+from kreps.experiments.cells import name_of
 from kreps.experiments.claims import write_claims
 from kreps.experiments.executors import executor
 from kreps.experiments.figures import draw_features, write_figure
-from kreps.experiments.runner import figure_cells, name_of, run_cells
+from kreps.experiments.runner import figure_cells, run_cells
 from kreps.experiments.search import CANDIDATES, search_cells, write_search
 from kreps.experiments.specs import FIGURES, PICTURES
 from kreps.learner import KREPS
@@ -213,9 +214,11 @@ def reproduce(
     if iterations is not None:
         command += f" --iterations {iterations}"
     cells = {name: figure_cells(name, trials, iterations) for name in wanted if name in FIGURES}
-    with executor(workers, scheduler) as pool:
-        every_cell = [cell for of_figure in cells.values() for cell in of_figure]
-        results = run_cells(every_cell, pool, out / "cells")
+    results = []
+    if cells:
+        with executor(workers, scheduler) as pool:
+            every_cell = [cell for of_figure in cells.values() for cell in of_figure]
+            results = run_cells(every_cell, pool, out / "cells")
     for name in wanted:
         if name in FIGURES:
             mine = {cell.name for cell in cells[name]}

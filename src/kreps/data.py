@@ -13,6 +13,9 @@ from kreps.arrays import BoolArray, FloatArray, IntArray
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels import Factor, factors_of
 
+LONGEST_SIDE = 1024
+"""Of an image, in pixels: smoothing costs its square in memory, its cube in time."""
+
 LARGEST = 1e100
 """Numbers beyond this are no data: their squares would overflow."""
 
@@ -52,10 +55,7 @@ class TaskSpec:
             object.__setattr__(self, "observation_size", operator.index(self.observation_size))
             groups = tuple(tuple(sorted({operator.index(i) for i in g})) for g in self.groups)
             object.__setattr__(self, "groups", tuple(g for g in groups if g))
-            if self.image_shape is not None:
-                height, width = (operator.index(size) for size in self.image_shape)
-                object.__setattr__(self, "image_shape", (height, width))
-        except (TypeError, ValueError) as error:
+        except TypeError as error:
             raise ConfigurationError(
                 f"observation_size = {self.observation_size!r} and periodic = {self.periodic!r}, "
                 "but a whole number and a list of whole numbers are needed, as 3 and (0, 2)"
@@ -84,7 +84,16 @@ class TaskSpec:
                 f"the group {mixed[0]} mixes angles and other coordinates, which share no scale"
             )
         if self.image_shape is not None:
-            height, width = self.image_shape
+            try:
+                height, width = (operator.index(size) for size in self.image_shape)
+            except (TypeError, ValueError):
+                height, width = 0, 0
+            if not (1 <= height <= LONGEST_SIDE and 1 <= width <= LONGEST_SIDE):
+                raise ConfigurationError(
+                    f"image_shape = {self.image_shape!r:.60}, but (height, width) is needed, two "
+                    f"whole numbers from 1 to {LONGEST_SIDE}"
+                )
+            object.__setattr__(self, "image_shape", (height, width))
             if {len(group) for group in self.groups} != {height * width} or (
                 len(grouped) != self.observation_size
             ):

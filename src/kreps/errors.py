@@ -26,6 +26,10 @@ class EnvironmentFailure(KrepsError, RuntimeError):
     """The environment raised during a roll-out; what was learnt before is untouched."""
 
 
+class CellFailure(KrepsError, RuntimeError):
+    """Cells of an experiment that raised; the others are kept."""
+
+
 class NumericalError(KrepsError, ArithmeticError):
     """A matrix could not be factorised even with the largest permitted jitter."""
 

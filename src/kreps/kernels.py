@@ -77,7 +77,7 @@ class SmoothedImage:
 
 @cache
 def _smoothing(size: int) -> FloatArray:
-    """A matrix (k, size), k < size, after which rows of pixels have the distances of smoothed ones.
+    """A matrix (k, size), k <= size, that gives rows of pixels the distances of smoothed ones.
 
     Smooth rows lie in few dimensions: only their coordinates there are kept.
     """

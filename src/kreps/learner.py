@@ -21,7 +21,7 @@ from kreps.arrays import FloatArray
 from kreps.controller import Policy
 from kreps.data import Rollout, TaskSpec, Window
 from kreps.errors import ConfigurationError, DataError
-from kreps.policies import BangBang, Gaussian, StochasticPolicy
+from kreps.policies import MAX_SUPPORT, BangBang, Gaussian, StochasticPolicy
 from kreps.rollout import Environment, collect, collect_grid, task_of, without_restarts
 from kreps.seeding import Purpose, generator
 from kreps.settings import (
@@ -396,7 +396,7 @@ class GridValueIteration(Learner[GridValueIterationSettings]):
             settings.ranges,
             settings.grid_states,
             settings.grid_actions,
-            most=settings.window,
+            most=min(settings.window, MAX_SUPPORT),
             seed=self.seed,
             iteration=self.state.iteration,
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -376,7 +377,7 @@ def learning_curves(
     with rc_context(STYLE):
         figure = Figure(figsize=(13.0, 5.0))
         plots = figure.subplots(1, len(PANELS), sharey=True)
-        for method, colour, line in zip(methods, COLOURS, LINES, strict=False):
+        for method, colour, line in zip(methods, cycle(COLOURS), cycle(LINES), strict=False):
             mine = [row for row in rows if row["method"] == method]
             for axes, (value, by, _) in zip(plots, PANELS, strict=True):
                 _draw_mean(axes, mine, value, by, method, colour, line)

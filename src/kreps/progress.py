@@ -1,4 +1,4 @@
-"""The live progress display of `KREPS.learn`: a table in a terminal, plain lines elsewhere."""
+"""The live progress display of `Learner.learn`: a table in a terminal, plain lines elsewhere."""
 
 from __future__ import annotations
 

@@ -46,8 +46,8 @@ def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec
         )
     if not isinstance(actions, gym.spaces.Box):
         raise SpaceError(
-            f"the action space is {actions}, but a Box is needed: the policy is a Gaussian "
-            "process over continuous actions; choose a continuous form of the task, or map a "
+            f"the action space is {actions}, but a Box is needed: policies choose "
+            "among continuous actions; choose a continuous form of the task, or map a "
             "Box to these actions with gymnasium.wrappers.TransformAction"
         )
     if not actions.is_bounded():
@@ -151,8 +151,9 @@ def collect_grid(
     if count > most:
         raise ConfigurationError(
             f"a grid of {grid_states} points in each of {task.observation_size} state and "
-            f"{grid_actions} in each of {task.action_size} action coordinates has {count} points, "
-            f"the limit is {most}; lower grid_states or grid_actions, or raise window"
+            f"{grid_actions} in each of {task.action_size} action coordinates has "
+            f"{count if count < 10**9 else 'more than 10^9'} points, the limit is {most} (the "
+            "window, and what an exact update can take); lower grid_states or grid_actions"
         )
     axes = [
         np.arange(grid_states) * 2.0 * np.pi / grid_states

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from numbers import Integral, Real
-from typing import Any, Literal, TypeVar, get_args
+from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 from kreps.errors import ConfigurationError
 
@@ -136,7 +136,7 @@ class ValueIterationSettings(OnPolicySettings):
     Attributes:
         temperature: of the softmax, in standard deviations of the reward.
         actions: candidate actions, evenly spaced over the range: the largest number of levels
-            per dimension whose product does not exceed this, at least two each.
+            per dimension whose product does not exceed this.
     """
 
     temperature: float = 1.0
@@ -162,6 +162,9 @@ class GridValueIterationSettings(LearnerSettings):
         grid_states: grid points per state coordinate.
         grid_actions: grid points per action coordinate.
     """
+
+    temperature: ClassVar[float] = 0.0
+    """Nothing has to be explored: the soft maximum is the maximum."""
 
     window: int = 6000
     ranges: tuple[tuple[float, float], ...] | None = None

@@ -30,9 +30,9 @@ from kreps.threads import blas_threads
 from kreps.value import ValueFunction
 from kreps.value_policies import LipschitzPolicy, SoftmaxPolicy
 
-VERSION = 1
+VERSION = 2
 MAX_FILE_BYTES = 2**30
-MAX_HEADER_BYTES = 2**18
+MAX_HEADER_BYTES = 2**22
 
 POLICY_ARRAYS = {
     "policy.lengthscales",
@@ -91,6 +91,11 @@ def write_arrays(path: Path, kind: str, tensors: Tensors, header: Header) -> Non
     """Write arrays and a JSON header; the same content gives the same bytes."""
     known = {"kind": kind, "version": VERSION, "arrays": sorted(tensors)}
     text = json.dumps({**known, **header}, sort_keys=True)
+    if len(text) > MAX_HEADER_BYTES // 2:  # quoting may double it
+        raise StorageError(
+            f"the header of {path} would have {len(text)} bytes, the limit is "
+            f"{MAX_HEADER_BYTES // 2}; observe with fewer coordinates, such as smaller images"
+        )
     arrays = {name: np.ascontiguousarray(tensors[name]) for name in sorted(tensors)}
     write_atomically(path, safetensors.numpy.save(arrays, metadata={"kreps": text}))
 
@@ -114,7 +119,9 @@ def read_arrays(path: Path, kind: str) -> tuple[Tensors, Header]:
                     raise StorageError(f"a {kind} has no array {name!r:.60}")
                 if file.get_slice(name).get_dtype() != "F64":
                     raise StorageError(f"array {name!r} is not of 64-bit floats")
-            promised = header.get("arrays", [])
+            promised = header.get("arrays")
+            if not isinstance(promised, list):
+                raise StorageError("its header does not name its arrays")
             missing = [n for n in promised if n not in names]
             if missing:
                 raise StorageError(f"array {missing[0]!r:.60} is missing")
@@ -272,8 +279,8 @@ def _softmax_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, m: int) -> Sof
         da=task.action_size,
     )
     offset, temperature = t["policy.offset_and_temperature"]
-    if len(t["policy.candidates"]) == 0 or temperature < 0:
-        raise StorageError("the policy has no candidate actions, or a temperature < 0")
+    if len(t["policy.candidates"]) == 0 or not (temperature == 0 or temperature > 1e-50):
+        raise StorageError("the policy has no candidate actions, or its temperature is no number")
     return SoftmaxPolicy(
         task,
         kernel,
@@ -328,6 +335,15 @@ _POLICIES: dict[str, tuple[type[Any], Callable[[Any], Tensors], Callable[..., Le
     "lipschitz": (LipschitzPolicy, _lipschitz_parts, _lipschitz_of),
 }
 """By name in files: the class, what to write of it beside kernel and states, how to read it."""
+
+
+POLICY_OF_METHOD = {
+    "reps": "cost-sensitive-gp",
+    "value-iteration": "softmax",
+    "grid-value-iteration": "softmax",
+    "npalp": "lipschitz",
+}
+"""What each method learns; the first has V in an RKHS beside it."""
 
 
 def _policy_parts(policy: LearntPolicy) -> tuple[Tensors, str]:
@@ -496,14 +512,16 @@ def load_checkpoint(
         window = Window(settings.window)
         if "window.lengths" in tensors:
             window = _window_of(tensors, task, settings.window)
-        g = task.factor_count
+        learnt, g = iteration > 0, task.factor_count
+        if learnt and header["policy"] != POLICY_OF_METHOD[method]:
+            raise StorageError(f"it holds a policy that {method} does not learn")
         state = LearnerState(
             window=window,
             iteration=iteration,
             rollouts=rollouts,
             steps=steps,
-            policy=_policy_of(tensors, task, header["policy"]) if iteration > 0 else None,
-            value=_value_of(tensors, task) if "value.alpha" in tensors else None,
+            policy=_policy_of(tensors, task, header["policy"]) if learnt else None,
+            value=_value_of(tensors, task) if learnt and method == "reps" else None,
             embedding_start=_start_of(tensors, "start.embedding", g + task.action_size + 1),
             policy_start=_start_of(tensors, "start.policy", g + 2),
         )

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import logsumexp, ndtr, ndtri, softmax
 
-from kreps.arrays import FloatArray
+from kreps.arrays import FloatArray, IntArray
 from kreps.data import TaskSpec
 from kreps.kernels import Kernel, gaussian_gram
 
@@ -69,7 +69,7 @@ class SoftmaxPolicy:
     def greedy(self, states: FloatArray) -> FloatArray:
         return self._actions(self.q_values(states).argmax(axis=1))
 
-    def _actions(self, chosen: FloatArray) -> FloatArray:
+    def _actions(self, chosen: IntArray) -> FloatArray:
         return self.task.unscaled(self.candidates[chosen])
 
 

@@ -53,7 +53,11 @@ class NPALPInfo:
 
     def shown(self) -> dict[str, str]:
         """What a progress display shows, by column."""
-        return {"improvements": f"{self.improvements}", "residual": f"{self.residual:.0e}"}
+        return {
+            "improvements": f"{self.improvements}",
+            "residual": f"{self.residual:.0e}",
+            "note": "" if self.residual <= RESIDUAL else "NOT CONVERGED",
+        }
 
 
 def update(

@@ -18,6 +18,7 @@ from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.dual import standardise
 from kreps.embedding import KernelEmbedding
+from kreps.errors import ConfigurationError
 from kreps.kernels import Kernel
 from kreps.settings import GridValueIterationSettings, ValueIterationSettings
 from kreps.value import RKHSBasis
@@ -91,7 +92,7 @@ def update(
     )
     clock.lap("embedding")
     rewards, unit = standardise(data.rewards)
-    temperature = settings.temperature if isinstance(settings, ValueIterationSettings) else 0.0
+    temperature = settings.temperature
     candidates = candidate_actions(task, settings.actions)
     table, offset, sweeps, change = iterate_values(
         model, data, rewards, candidates, temperature, 1.0 - settings.restart_probability
@@ -112,8 +113,18 @@ def update(
 
 
 def candidate_actions(task: TaskSpec, count: int) -> FloatArray:
-    """At most ``count`` evenly spaced scaled actions (k, da), limits included."""
-    levels = max(2, int(count ** (1.0 / task.action_size) + 1e-9))
+    """At most ``count`` evenly spaced scaled actions (k, da), limits included.
+
+    Raises:
+        ConfigurationError: not even the limits of every action coordinate fit.
+    """
+    levels = int(count ** (1.0 / task.action_size) + 1e-9)
+    if levels < 2:
+        raise ConfigurationError(
+            f"actions = {count}, but the limits of {task.action_size} action coordinates alone "
+            f"make 2^{task.action_size} candidates; raise actions, or use kreps.KREPS, which has "
+            "no grid"
+        )
     axes = [np.linspace(-1.0, 1.0, levels)] * task.action_size
     return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -58,7 +58,8 @@ class Cell:
     def work(self) -> str:
         """What is to be done, whatever it is called: cells that agree in it have one result."""
         names = ("task", "method", "label")
-        return json.dumps({k: v for k, v in self.description().items() if k not in names})
+        work = {k: v for k, v in self.description().items() if k not in names}
+        return json.dumps(work, sort_keys=True)
 
     def named(self, result: Mapping[str, Any]) -> dict[str, Any]:
         """The result of a cell of the same work as that of this one."""
@@ -163,3 +164,13 @@ def write_cell(cell: Cell, folder: Path, result: dict[str, Any]) -> None:
     except OSError as error:
         raise StorageError(f"cannot make the folder {path.parent}: {error}") from error
     write_atomically(path, (json.dumps(result) + "\n").encode())
+
+
+def name_of(result: Mapping[str, Any]) -> str:
+    """The name of the cell that a result is of."""
+    return Cell(**result["cell"]).name
+
+
+def commits_of(results: Sequence[Mapping[str, Any]]) -> str:
+    """The commits at which the cells were run: one, if all went well."""
+    return ", ".join(sorted({result["commit"] for result in results}))

@@ -1,10 +1,12 @@
-"""The paper's claims, each as a comparison of two groups of seeds with an interval and a verdict.
+"""The paper's claims, each as a comparison of groups of seeds with an interval and a verdict.
 
-A claim is a difference of means between two curves, in reward per step and so that a positive
-one supports the paper.  Its 95 % interval is a percentile bootstrap over seeds, resampled
-within each curve.  *Confirmed*: the interval lies above zero; *contradicted*: below; otherwise
-*not separated*.  A claim that two curves end equal is confirmed where the interval lies
-within a margin around zero, and contradicted where it lies outside.
+A claim is a difference of means between two curves, or a gain within one, in reward per step and so
+that a positive one supports the paper.  Its 95 % interval is a percentile bootstrap over seeds,
+resampled within each curve.  *Confirmed*: the interval lies above the limit; *contradicted*: below;
+otherwise *not separated*.  The limit is zero for "better"; for "as good as" it is minus a margin
+of a twentieth of the way from the first policy to the best known one.  A claim that two curves end
+equal, or that one has stopped, is confirmed where the interval lies within that margin around
+zero, and contradicted where it lies outside.
 """
 
 from __future__ import annotations
@@ -13,6 +15,7 @@ import csv
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,17 @@ import numpy as np
 from scipy.stats import bootstrap
 
 from kreps.arrays import FloatArray
+from kreps.errors import StorageError
+from kreps.experiments.figures import named_rows
+from kreps.experiments.specs import (
+    ANY_STATE,
+    FEATURES,
+    KERNEL,
+    NPALP,
+    SAMPLE,
+    VALUES,
+)
+from kreps.experiments.tables import markdown
 from kreps.seeding import Purpose, generator
 from kreps.storage import write_atomically
 
@@ -35,36 +49,51 @@ EARLY = 4
 LATE = 5
 """Iterations, from the last one back, that count as the end."""
 
+MARGINS = {"figure-1a": 0.04, "figure-1b": 4.0, "figure-2b": 4.0}
+"""A twentieth of the way from the first policy to the best known one, rounded."""
+
+
+def _mean(rows: Rows, name: str) -> float:
+    return float(np.mean([float(row[name]) for row in rows]))
+
 
 def early(rows: Rows) -> float:
     """Evaluated reward with exploration, mean over the first iterations."""
-    return float(np.mean([float(row["stochastic"]) for row in rows[:EARLY]]))
+    return _mean(rows[:EARLY], "stochastic")
 
 
 def late(rows: Rows) -> float:
     """Evaluated reward with exploration, mean over the last iterations."""
-    return float(np.mean([float(row["stochastic"]) for row in rows[-LATE:]]))
+    return _mean(rows[-LATE:], "stochastic")
 
 
 def late_greedy(rows: Rows) -> float:
     """Evaluated reward without exploration, mean over the last iterations."""
-    return float(np.mean([float(row["greedy"]) for row in rows[-LATE:]]))
+    return _mean(rows[-LATE:], "greedy")
 
 
 def whole(rows: Rows) -> float:
     """Evaluated reward with exploration, mean over all iterations: how fast it learnt."""
-    return float(np.mean([float(row["stochastic"]) for row in rows]))
+    return _mean(rows, "stochastic")
 
 
-def progress(rows: Rows) -> float:
-    """Gain from the first iterations to the last ones."""
-    return late(rows) - early(rows)
+def later_gain(rows: Rows) -> float:
+    """Gain from the iterations after the first ones to the last ones, with exploration."""
+    return late(rows) - _mean(rows[EARLY : EARLY + LATE], "stochastic")
 
 
 def steadiness(rows: Rows) -> float:
-    """Minus the mean loss of an iteration that loses, over the second half of learning."""
+    """Minus the mean loss between iterations (a gain counts as zero), over the second half."""
     values = np.array([float(row["stochastic"]) for row in rows[len(rows) // 2 :]])
     return float(np.mean(np.minimum(np.diff(values), 0.0)))
+
+
+class Kind(StrEnum):
+    """What a claim says of the difference."""
+
+    BETTER = "better"
+    AS_GOOD = "at least as good"
+    EQUAL = "equal"
 
 
 @dataclass(frozen=True)
@@ -75,124 +104,92 @@ class Claim:
         text: what the paper says.
         figure: whose result file holds the rows.
         better, worse: curves as the figure names them; ``better`` should have the larger measure.
+            Where ``worse`` is None the measure of ``better`` is compared with zero.
         measure: of one seed.
-        margin: for a claim of equality, the largest difference that still counts as equal.
+        kind: of the claim.
     """
 
     text: str
     figure: str
     better: str
-    worse: str
+    worse: str | None
     measure: Measure
-    margin: float | None = None
+    kind: Kind = Kind.BETTER
 
 
-_KERNEL, _SAMPLE, _GRID = "kernel REPS", "REPS, sample model", "REPS, RBF grid"
-_VALUES, _NPALP = "value iteration", "NPALP"
-_ANY_STATE = "value iteration on a grid (simulator set to any state)"
-_LOW, _IMAGES = "kernel REPS, swing-up", "kernel REPS, images"
+def _on_images(method: str) -> str:
+    return f"{method}, images"
+
+
+_1A, _1B, _2B = "figure-1a", "figure-1b", "figure-2b"
 
 CLAIMS = (
     Claim(
         "Reaching: the sample model is at least as good as the embedding, as the task is "
         "deterministic",
-        "figure-1a",
-        _SAMPLE,
-        _KERNEL,
-        late,
+        *(_1A, SAMPLE, KERNEL, late, Kind.AS_GOOD),
     ),
-    Claim("Reaching: the embedding learns more slowly", "figure-1a", _SAMPLE, _KERNEL, whole),
-    Claim("Reaching: NPALP is good after a few iterations", "figure-1a", _NPALP, _KERNEL, early),
+    Claim("Reaching: the embedding learns more slowly", _1A, SAMPLE, KERNEL, whole),
+    Claim("Reaching: NPALP is good after a few iterations", _1A, NPALP, KERNEL, early),
+    Claim("Reaching: value iteration is good after a few iterations", _1A, VALUES, KERNEL, early),
+    Claim("Reaching: NPALP then stops improving", _1A, NPALP, None, later_gain, Kind.EQUAL),
     Claim(
-        "Reaching: value iteration is good after a few iterations",
-        "figure-1a",
-        _VALUES,
-        _KERNEL,
-        early,
+        "Reaching: value iteration then stops improving",
+        *(_1A, VALUES, None, later_gain, Kind.EQUAL),
     ),
-    Claim("Reaching: NPALP stops improving, REPS does not", "figure-1a", _KERNEL, _NPALP, progress),
+    Claim("Reaching: kernel REPS goes on improving", _1A, KERNEL, None, later_gain),
+    Claim("Reaching: kernel REPS ends better than NPALP", _1A, KERNEL, NPALP, late),
+    Claim("Reaching: the same without exploration", _1A, KERNEL, NPALP, late_greedy),
+    Claim("Reaching: kernel REPS ends better than value iteration", _1A, KERNEL, VALUES, late),
+    Claim("Reaching: the same without exploration", _1A, KERNEL, VALUES, late_greedy),
     Claim(
-        "Reaching: value iteration stops improving, REPS does not",
-        "figure-1a",
-        _KERNEL,
-        _VALUES,
-        progress,
+        "Reaching: value iteration on a grid fails (ends worse than on-policy value iteration)",
+        *(_1A, VALUES, ANY_STATE, late_greedy),
     ),
-    Claim("Reaching: REPS ends better than NPALP", "figure-1a", _KERNEL, _NPALP, late),
-    Claim("Reaching: REPS ends better than value iteration", "figure-1a", _KERNEL, _VALUES, late),
-    Claim("Reaching: value iteration on a grid fails", "figure-1a", _KERNEL, _ANY_STATE, late),
     Claim(
         "Swing-up: kernel REPS ends better than on-policy value iteration",
-        "figure-1b",
-        _KERNEL,
-        _VALUES,
-        late,
+        *(_1B, KERNEL, VALUES, late),
     ),
-    Claim(
-        "Swing-up: the same without exploration noise",
-        "figure-1b",
-        _KERNEL,
-        _VALUES,
-        late_greedy,
-    ),
+    Claim("Swing-up: the same without exploration", _1B, KERNEL, VALUES, late_greedy),
     Claim(
         "Swing-up: kernel REPS ends better than REPS on fixed features",
-        "figure-1b",
-        _KERNEL,
-        _GRID,
-        late,
+        *(_1B, KERNEL, FEATURES, late),
     ),
     Claim(
-        "Swing-up: REPS on fixed features is better at first", "figure-1b", _GRID, _KERNEL, early
+        "Swing-up: REPS on fixed features performs well initially (as well as kernel REPS)",
+        *(_1B, FEATURES, KERNEL, early, Kind.AS_GOOD),
+    ),
+    Claim("Swing-up: the sample model ends considerably worse", _1B, KERNEL, SAMPLE, late),
+    Claim(
+        "Swing-up: on-policy value iteration starts out competitively",
+        *(_1B, VALUES, KERNEL, early, Kind.AS_GOOD),
     ),
     Claim(
-        "Swing-up: the sample model ends considerably worse", "figure-1b", _KERNEL, _SAMPLE, late
+        "Swing-up: on-policy value iteration is unstable, kernel REPS is smooth",
+        *(_1B, KERNEL, VALUES, steadiness),
     ),
     Claim(
-        "Swing-up: on-policy value iteration is competitive at first",
-        "figure-1b",
-        _VALUES,
-        _KERNEL,
-        early,
+        "Swing-up: value iteration on a grid works well (as well as kernel REPS)",
+        *(_1B, ANY_STATE, KERNEL, late_greedy, Kind.AS_GOOD),
     ),
     Claim(
-        "Swing-up: on-policy value iteration is unstable, REPS is smooth",
-        "figure-1b",
-        _KERNEL,
-        _VALUES,
-        steadiness,
+        "Images: learning is a bit slower than from joint values",
+        *(_2B, f"{KERNEL}, swing-up", _on_images(KERNEL), whole),
     ),
     Claim(
-        "Swing-up: value iteration on a grid works well (at least as well as kernel REPS)",
-        "figure-1b",
-        _ANY_STATE,
-        _KERNEL,
-        late,
-    ),
-    Claim("Images: learning is a bit slower", "figure-2b", _LOW, _IMAGES, whole),
-    Claim(
-        "Images: the final solution is equally good (within 2 points)",
-        "figure-2b",
-        _IMAGES,
-        _LOW,
-        late,
-        margin=2.0,
+        "Images: the final solution is equally good",
+        *(_2B, _on_images(KERNEL), f"{KERNEL}, swing-up", late, Kind.EQUAL),
     ),
     Claim(
-        "Images: kernel REPS ends better than the sample model",
-        "figure-2b",
-        _IMAGES,
-        "REPS, sample model, images",
-        late,
+        "Images: kernel REPS ends better than the sample model (shown, not said)",
+        *(_2B, _on_images(KERNEL), _on_images(SAMPLE), late),
     ),
 )
 
 
-def by_seed(rows: Rows, curve: str, measure: Measure) -> FloatArray:
-    """The measure of each seed of a curve."""
-    from kreps.experiments.figures import named_rows
-
-    mine = [row for row in named_rows(rows) if row["method"] == curve]
+def by_seed(rows: Rows, curve: str, measure: Measure, iterations: int) -> FloatArray:
+    """The measure of each seed of a curve, over so many iterations."""
+    mine = [r for r in rows if r["method"] == curve and int(r["iteration"]) <= iterations]
     seeds = sorted({int(row["seed"]) for row in mine})
     of_seed = [
         sorted((r for r in mine if int(r["seed"]) == seed), key=lambda r: int(r["iteration"]))
@@ -201,24 +198,38 @@ def by_seed(rows: Rows, curve: str, measure: Measure) -> FloatArray:
     return np.array([measure(each) for each in of_seed])
 
 
-def verdict(low: float, high: float, margin: float | None) -> str:
+def common_iterations(rows: Rows, curves: Sequence[str]) -> int:
+    """How many iterations curves are compared over: all that both have, if they have several."""
+    last = [max((int(r["iteration"]) for r in rows if r["method"] == c), default=0) for c in curves]
+    return min((number for number in last if number > 1), default=1)
+
+
+def verdict(low: float, high: float, kind: Kind, margin: float) -> str:
     """What an interval says of a claim."""
-    if margin is None:
-        return "confirmed" if low > 0 else "contradicted" if high < 0 else "not separated"
-    if -margin <= low and high <= margin:
-        return "confirmed"
-    return "contradicted" if low > margin or high < -margin else "not separated"
+    if kind is Kind.EQUAL:
+        if -margin <= low and high <= margin:
+            return "confirmed"
+        return "contradicted" if low > margin or high < -margin else "not separated"
+    limit = 0.0 if kind is Kind.BETTER else -margin
+    return "confirmed" if low > limit else "contradicted" if high < limit else "not separated"
 
 
 def judge(claim: Claim, rows: Rows) -> dict[str, Any] | None:
-    """Effect, interval and verdict; None if the rows hold fewer than two seeds of either curve."""
-    a = by_seed(rows, claim.better, claim.measure)
-    b = by_seed(rows, claim.worse, claim.measure)
-    if min(len(a), len(b)) < 2:
+    """Effect, interval and verdict; None if the rows hold fewer than two seeds of a curve."""
+    rows = named_rows(rows)
+    curves = [claim.better] if claim.worse is None else [claim.better, claim.worse]
+    iterations = common_iterations(rows, curves)
+    samples = [by_seed(rows, curve, claim.measure, iterations) for curve in curves]
+    if min(len(sample) for sample in samples) < 2:
         return None
+
+    def effect(*drawn: FloatArray, axis: int = -1) -> FloatArray:
+        means = [each.mean(axis=axis) for each in drawn]
+        return means[0] if len(means) == 1 else means[0] - means[1]
+
     found = bootstrap(
-        (a, b),
-        lambda x, y, axis: x.mean(axis=axis) - y.mean(axis=axis),
+        samples,
+        effect,
         n_resamples=RESAMPLES,
         method="percentile",
         vectorized=True,
@@ -228,13 +239,16 @@ def judge(claim: Claim, rows: Rows) -> dict[str, Any] | None:
     return {
         "claim": claim.text,
         "figure": claim.figure,
-        "comparison": f"{claim.better} less {claim.worse}",
-        "measure": claim.measure.__name__.replace("_", ", "),
-        "effect": round(float(a.mean() - b.mean()), 4),
+        "comparison": claim.better if claim.worse is None else f"{claim.better} - {claim.worse}",
+        "measure": claim.measure.__name__.replace("_", " "),
+        "iterations": iterations,
+        "kind": claim.kind.value,
+        "margin": 0.0 if claim.kind is Kind.BETTER else MARGINS[claim.figure],
+        "effect": round(float(effect(*samples)), 4),
         "low": round(low, 4),
         "high": round(high, 4),
-        "seeds": [len(a), len(b)],
-        "verdict": verdict(low, high, claim.margin),
+        "seeds": [len(sample) for sample in samples],
+        "verdict": verdict(low, high, claim.kind, MARGINS[claim.figure]),
     }
 
 
@@ -244,8 +258,14 @@ def write_claims(folder: Path) -> list[Path]:
     for claim in CLAIMS:
         path = folder / f"{claim.figure}.csv"
         if path.exists():
-            with open(path, newline="") as file:
-                judged.append(judge(claim, list(csv.DictReader(file))))
+            try:
+                with open(path, newline="") as file:
+                    judged.append(judge(claim, list(csv.DictReader(file))))
+            except (KeyError, ValueError, TypeError) as error:
+                raise StorageError(
+                    f"{path} is damaged or foreign ({error!r}); make it again with "
+                    f"`kreps reproduce {claim.figure}`"
+                ) from error
     found = [each for each in judged if each is not None]
     if not found:
         return []
@@ -256,12 +276,20 @@ def write_claims(folder: Path) -> list[Path]:
 
 def claims_table(judged: Sequence[Mapping[str, Any]]) -> str:
     """The claims as the documentation shows them."""
-    lines = ["| claim | measure | difference | 95 % interval | verdict |", "|---|---|---|---|---|"]
+    rows = []
     for each in judged:
         places = 1 if max(abs(each["low"]), abs(each["high"])) >= 1 else 3
-        numbers = [f"{each[name]:+.{places}f}" for name in ("effect", "low", "high")]
-        lines.append(
-            f"| {each['claim']} | {each['measure']} | {numbers[0]} | {numbers[1]} to {numbers[2]} "
-            f"| **{each['verdict']}** |"
+        effect, low, high = (f"{each[name]:+.{places}f}" for name in ("effect", "low", "high"))
+        kind = each["kind"] + (f" (margin {each['margin']:g})" if each["margin"] else "")
+        rows.append(
+            [
+                each["claim"],
+                f"{each['measure']}: {each['comparison']}",
+                effect,
+                f"{low} to {high}",
+                kind,
+                f"**{each['verdict']}**",
+            ]
         )
-    return "\n".join(lines)
+    headings = ("claim", "measure", "effect", "95 % interval", "to be confirmed as", "verdict")
+    return markdown(headings, rows)

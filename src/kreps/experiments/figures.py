@@ -15,7 +15,9 @@ import numpy as np
 from kreps.envs.image_swing_up import PIXELS
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.envs.swing_up import TIME_STEP
+from kreps.experiments.cells import commits_of
 from kreps.experiments.specs import TASKS
+from kreps.experiments.tables import markdown
 from kreps.policies import BangBang
 from kreps.rollout import simulate, task_of
 from kreps.runs import versions
@@ -26,11 +28,6 @@ from kreps.storage import write_atomically
 def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """One row per method, seed and iteration."""
     return [row for result in results for row in result["rows"]]
-
-
-def commits_of(results: Sequence[Mapping[str, Any]]) -> str:
-    """The commits at which the cells were run: one, if all went well."""
-    return ", ".join(sorted({result["commit"] for result in results}))
 
 
 def curve_name(row: Mapping[str, Any], several_tasks: bool) -> str:
@@ -117,13 +114,11 @@ def table_rows(summary: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
 
 def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
     """The summary as the documentation shows it, with the CPU seconds of an update."""
-    headings = [*TABLE_HEADINGS, "CPU s / update"]
     rows = [
-        [*row, f"{entry['mean_update_cpu_seconds']:.2f}"]
+        [*row, f"{entry['iteration']}", f"{entry['mean_update_cpu_seconds']:.2f}"]
         for row, entry in zip(table_rows(summary), summary.values(), strict=True)
     ]
-    lines = [f"| {' | '.join(cells)} |" for cells in (headings, *rows)]
-    return "\n".join([lines[0], "|---" * len(headings) + "|", *lines[1:]])
+    return markdown([*TABLE_HEADINGS, "iterations", "CPU s / update"], rows)
 
 
 TITLES = {

@@ -16,6 +16,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from kreps.errors import CellFailure
 from kreps.evaluation import EPISODES
 from kreps.experiments.cells import Cell, cell_of, read_cell, run_cell, write_cell
 from kreps.experiments.search import tuned_options
@@ -45,7 +46,10 @@ def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[d
     """The result of each cell; what is not in the folder yet is run, and kept when it is there.
 
     Cells of the same work under different names are run once.
-    A cell that fails does not keep the others from being run; its error is raised at the end.
+    A cell that fails does not keep the others from being run.
+
+    Raises:
+        CellFailure: some failed; the first error is its cause.
     """
     cells = list({cell.name: cell for cell in cells}.values())
     results = {cell.name: read_cell(cell, folder) for cell in cells}
@@ -59,7 +63,8 @@ def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[d
     )
     with bar:
         task = bar.add_task("cells", total=len(cells), completed=len(cells) - len(left), last="")
-        failures: list[Exception] = []
+        failures: dict[str, Exception] = {}
+        source = commit()  # the code that is about to run, whatever happens to the tree meanwhile
         done = {cell.work: result for cell in cells if (result := results[cell.name])}
         same: dict[str, list[Cell]] = {}
         for cell in left:
@@ -70,6 +75,9 @@ def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[d
                 results[cell.name] = result = cell.named(fresh)
                 write_cell(cell, folder, result)
                 bar.update(task, advance=1, last=cell.name)
+                if not bar.console.is_terminal:  # a log: a line each
+                    done_now = sum(1 for each in results.values() if each)
+                    print(f"{done_now}/{len(cells)} cells: {cell.name}", flush=True)
 
         for work in same.keys() & done.keys():
             keep(work, done[work])
@@ -82,16 +90,20 @@ def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[d
             for future in as_completed(running):
                 work = running[future]
                 try:
-                    fresh = {"commit": commit(), **future.result()}
+                    fresh = {"commit": source, **future.result()}
                 except Exception as error:  # the other cells are worth having all the same
-                    failures.append(error)
+                    failures[same[work][0].name] = error
                     continue
                 keep(work, fresh)
         except BaseException:
             executor.shutdown(wait=False, cancel_futures=True)
             raise
     if failures:
-        raise failures[0]
+        name, first = next(iter(failures.items()))
+        raise CellFailure(
+            f"{len(failures)} of {len(cells)} cells failed, first {name}: "
+            f"{type(first).__name__}: {first}; the others are kept, so call it again"
+        ) from first
     return [result for cell in cells if (result := results[cell.name]) is not None]
 
 
@@ -110,8 +122,3 @@ def commit() -> str:
         return git("rev-parse", "--short=12", "HEAD") + ("+" if changed else "")
     except (OSError, subprocess.SubprocessError):
         return "unknown"
-
-
-def name_of(result: Mapping[str, Any]) -> str:
-    """The name of the cell that a result is of."""
-    return Cell(**result["cell"]).name

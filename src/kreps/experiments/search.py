@@ -1,7 +1,7 @@
 """The parameter search that every compared method gets, on seeds that no figure uses.
 
-Each method on each task has the same number of candidates, written down here before any was
-run, the first being its defaults.  Each is learnt on the same seeds; what counts is the evaluated
+Each method on each task has the same number of candidates, the first being its defaults where the
+task permits them.  Each is learnt on the same seeds; what counts is the evaluated
 reward of the policy, half with its exploration and half without, averaged over the last updates and
 the seeds.  (With exploration alone, value iteration would be chosen for exploring little, and be
 shown at far less than what its greedy policy can do.)
@@ -11,14 +11,25 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from kreps.experiments.cells import Cell, cell_of
-from kreps.experiments.specs import METHODS
+from kreps.errors import StorageError
+from kreps.experiments.cells import Cell, cell_of, commits_of, name_of
+from kreps.experiments.specs import (
+    ANY_STATE,
+    FEATURES,
+    KERNEL,
+    METHODS,
+    NPALP,
+    SAMPLE,
+    VALUES,
+)
+from kreps.experiments.tables import markdown
 from kreps.storage import write_atomically
 
 SEEDS = (200, 201)
@@ -41,7 +52,7 @@ _VALUE_ITERATION: tuple[dict[str, Any], ...] = (
     {},
     {"temperature": 0.3},
     {"temperature": 0.1},
-    {"temperature": 0.03},
+    {"temperature": 3.0},
     {"temperature": 0.3, "actions": 9},
     {"temperature": 0.1, "actions": 9},
 )
@@ -53,13 +64,11 @@ def _grids(*sizes: tuple[int, int]) -> tuple[dict[str, Any], ...]:
 
 CANDIDATES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
     "reaching": {
-        "kernel REPS": _REPS,
-        "REPS, sample model": _REPS,
-        "value iteration": _VALUE_ITERATION,
-        "value iteration on a grid (simulator set to any state)": _grids(
-            (4, 3), (3, 3), (3, 5), (3, 7), (4, 4), (5, 3)
-        ),
-        "NPALP": (
+        KERNEL: _REPS,
+        SAMPLE: _REPS,
+        VALUES: _VALUE_ITERATION,
+        ANY_STATE: _grids((4, 3), (3, 3), (3, 5), (3, 7), (4, 4), (5, 3)),
+        NPALP: (
             {},
             {"lipschitz": 3.0},
             {"lipschitz": 30.0},
@@ -69,24 +78,22 @@ CANDIDATES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
         ),
     },
     "swing-up": {
-        "kernel REPS": _REPS,
-        "REPS, sample model": _REPS,
-        "REPS, RBF grid": (
+        KERNEL: _REPS,
+        SAMPLE: _REPS,
+        FEATURES: (
             {},
             {"recipe": "paper"},
-            {"kl_bound": 0.7},
+            {"grid_size": 20},
             {"ridge": 0.03},
             {"grid_size": 7},
             {"grid_size": 15},
         ),
-        "value iteration": _VALUE_ITERATION,
-        "value iteration on a grid (simulator set to any state)": _grids(
-            (15, 7), (10, 7), (20, 5), (25, 5), (20, 9), (30, 3)
-        ),
+        VALUES: _VALUE_ITERATION,
+        ANY_STATE: _grids((15, 7), (10, 7), (20, 5), (25, 5), (20, 9), (30, 3)),
     },
     "images": {
-        "kernel REPS": _REPS,
-        "REPS, sample model": _REPS,
+        KERNEL: _REPS,
+        SAMPLE: _REPS,
     },
 }
 
@@ -142,17 +149,18 @@ def write_search(
     path: Path, command: str, tasks: Sequence[str], results: Sequence[Mapping[str, Any]]
 ) -> Path:
     """The outcome of the search on some tasks, beside what the file says of the others."""
-    by_name = {Cell(**result["cell"]).name: result for result in results}
+    by_name = {name_of(result): result for result in results}
     try:
         found = json.loads(path.read_text())["outcome"]
     except FileNotFoundError:
         found = {}
+    except (ValueError, KeyError, TypeError) as error:
+        raise StorageError(f"{path} is damaged ({error!r}); remove it and search again") from error
     for task in tasks:
         found[task] = {m: outcome(task, m, by_name) for m in CANDIDATES[task]}
-    commits = sorted({result["commit"] for result in results})
     content = {
         "command": command,
-        "commit": ", ".join(commits),
+        "commit": commits_of(results),
         "seeds": SEEDS,
         "iterations": ITERATIONS,
         "score": "evaluated reward, half with exploration and half without, "
@@ -166,23 +174,29 @@ def write_search(
 
 def search_table(content: Mapping[str, Any]) -> str:
     """The scores of all candidates as the documentation shows them, the chosen one in bold."""
-    lines = ["| task | method | scores of the candidates | chosen |", "|---|---|---|---|"]
+    rows = []
     for task, methods in content["outcome"].items():
         for method, found in methods.items():
             means = [float(np.mean(each["scores"])) for each in found["candidates"]]
             places = 1 if max(map(abs, means)) >= 1 else 3
             shown = [f"{mean:.{places}f}" for mean in means]
-            best = int(np.argmax(means))
+            best = [each["options"] for each in found["candidates"]].index(found["chosen"])
             shown[best] = f"**{shown[best]}**"
             options = ", ".join(f"`{k}={v!r}`" for k, v in found["chosen"].items()) or "defaults"
-            lines.append(f"| {task} | {method} | {', '.join(shown)} | {options} |")
-    return "\n".join(lines)
+            rows.append([task, method, ", ".join(shown), options])
+    return markdown(("task", "method", "scores of the candidates", "chosen"), rows)
 
 
 def tuned_options(task: str, method: str) -> dict[str, Any]:
-    """What the search chose, from the file of its outcome; the defaults where it chose nothing."""
+    """What the search chose for a method, by the committed file of its outcome."""
     if not METHODS[method].tuned:
         return {}
+    chosen = _committed_outcome()[task][method]["chosen"]
+    return dict(chosen)
+
+
+@cache
+def _committed_outcome() -> dict[str, Any]:
     file = resources.files("kreps.experiments").joinpath("search.json")
-    found = json.loads(file.read_text())["outcome"] if file.is_file() else {}
-    return dict(found.get(task, {}).get(method, {}).get("chosen", {}))
+    outcome: dict[str, Any] = json.loads(file.read_text())["outcome"]
+    return outcome

@@ -24,7 +24,7 @@ class Task:
         environment: Gymnasium name.
         iterations: policy updates of each trial.
         exploration: options of every learner that explores by itself.
-        ranges: of the grid of states, for the learner that has one.
+        ranges: of the grid of states, for the learner that has one (an angle gets a whole turn).
         episodes: of the evaluation after each update; the last policy is evaluated in full.
     """
 
@@ -67,33 +67,38 @@ class Method:
     once: bool = False
 
 
-METHODS: dict[str, Method] = {
-    "kernel REPS": Method("reps"),
-    "REPS, sample model": Method("reps", {"model": "sample"}),
-    "REPS, RBF grid": Method("reps", {"features": "grid"}),
-    "value iteration": Method("value-iteration"),
-    "value iteration on a grid (simulator set to any state)": Method(
-        "grid-value-iteration", once=True
-    ),
-    "NPALP": Method("npalp"),
-    "kreps (default)": Method("reps", tuned=False),
-    "paper-like": Method("reps", {"recipe": "paper"}, tuned=False),
-}
+KERNEL = "kernel REPS"
+SAMPLE = "REPS, sample model"
+FEATURES = "REPS, RBF grid"
+VALUES = "value iteration"
+ANY_STATE = "value iteration on a grid (simulator set to any state)"
+NPALP = "NPALP"
+DEFAULT = "kreps (default)"
+PAPER = "paper-like"
 
-_KERNEL, _SAMPLE, _FEATURES, _VALUES, _GRID, _NPALP, _DEFAULT, _PAPER = METHODS
+METHODS: dict[str, Method] = {
+    KERNEL: Method("reps"),
+    SAMPLE: Method("reps", {"model": "sample"}),
+    FEATURES: Method("reps", {"features": "grid"}),
+    VALUES: Method("value-iteration"),
+    ANY_STATE: Method("grid-value-iteration", once=True),
+    NPALP: Method("npalp"),
+    DEFAULT: Method("reps", tuned=False),
+    PAPER: Method("reps", {"recipe": "paper"}, tuned=False),
+}
 
 Curve = tuple[str, str]
 """A task and a method."""
 
 FIGURES: dict[str, tuple[Curve, ...]] = {
     # Feature-based REPS needs a grid over the state space: left out on reaching, as in the paper.
-    "figure-1a": tuple(("reaching", m) for m in (_KERNEL, _SAMPLE, _NPALP, _VALUES, _GRID)),
+    "figure-1a": tuple(("reaching", m) for m in (KERNEL, SAMPLE, NPALP, VALUES, ANY_STATE)),
     # NPALP is for deterministic tasks: left out on the swing-up, as in the paper.
-    "figure-1b": tuple(("swing-up", m) for m in (_KERNEL, _SAMPLE, _FEATURES, _VALUES, _GRID)),
-    "figure-2b": (("images", _KERNEL), ("images", _SAMPLE), ("swing-up", _KERNEL)),
-    "swing-up": tuple(("swing-up", m) for m in (_DEFAULT, _PAPER)),
+    "figure-1b": tuple(("swing-up", m) for m in (KERNEL, SAMPLE, FEATURES, VALUES, ANY_STATE)),
+    "figure-2b": (("images", KERNEL), ("images", SAMPLE), ("swing-up", KERNEL)),
+    "swing-up": tuple(("swing-up", m) for m in (DEFAULT, PAPER)),
     # one configuration for all tasks, nothing tuned
-    "defaults": tuple((task, _DEFAULT) for task in TASKS),
+    "defaults": tuple((task, DEFAULT) for task in TASKS),
 }
 PICTURES = ("figure-2a",)
 """Figures without an experiment: the features of the images."""
