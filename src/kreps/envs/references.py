@@ -12,12 +12,12 @@ REFERENCE_REWARDS: dict[str, dict[str, float]] = {
         "uniformly random torque": -101.0,
     },
     "kreps/Reaching-v0": {
-        "optimum (direct optimal control)": -0.102,
+        "best known (direct optimal control)": -0.064,
         "random torques (0.5 N m)": -0.8,
     },
 }
 """From best to worst, at least two.  The lean is the local optimum in which many learners stop:
-full torque held to one side.  Tests measure all but the optima, which `benchmarks/` computes."""
+full torque held to one side.  Tests measure all but the best, which `benchmarks/` computes."""
 
 REFERENCE_REWARDS["kreps/ImageSwingUp-v0"] = REFERENCE_REWARDS["kreps/SwingUp-v0"]
 """The same process seen by a camera: what full knowledge of its state reaches bounds it."""
