@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +11,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 from PIL import Image
 
 from kreps.algorithms.state import LearnerState
@@ -349,9 +349,9 @@ def _draw_seeds(axes: Axes, rows: Sequence[Mapping[str, Any]], name: str) -> Non
     axes.legend(loc="lower right")
 
 
-COLOURS = ("#20639b", "#d1603d", "#3caea3", "#8e5ea2", "#5b6068")
+COLOURS = ("#20639b", "#d1603d", "#c29b19", "#8e5ea2", "#5b6068", "#3caea3")
 """Of the curves of a figure, in their order; so are the line styles, for who sees no colours."""
-LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)))
+LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)), (0, (7, 2)))
 
 PANELS = (
     ("training_reward", "iteration", "As in the paper: training roll-outs"),
@@ -361,7 +361,11 @@ PANELS = (
 
 
 def learning_curves(
-    rows: Sequence[Mapping[str, Any]], references: Mapping[str, float], title: str, source: str
+    rows: Sequence[Mapping[str, Any]],
+    references: Mapping[str, float],
+    title: str,
+    source: str,
+    known: Sequence[str] = (),
 ) -> Figure:
     """Mean and twice the standard error of every method: by iteration, and by environment steps.
 
@@ -372,12 +376,16 @@ def learning_curves(
         references: values to draw as lines, by name.
         title: of the figure.
         source: command and commit that made it, printed below.
+        known: methods that keep their colour from figure to figure.
     """
     methods = list(dict.fromkeys(row["method"] for row in rows))
+    places = {name: i for i, name in enumerate(dict.fromkeys([*known, *methods]))}
     with rc_context(STYLE):
         figure = Figure(figsize=(13.0, 5.0))
         plots = figure.subplots(1, len(PANELS), sharey=True)
-        for method, colour, line in zip(methods, cycle(COLOURS), cycle(LINES), strict=False):
+        for method in methods:
+            colour = COLOURS[places[method] % len(COLOURS)]
+            line = LINES[places[method] % len(LINES)]
             mine = [row for row in rows if row["method"] == method]
             for axes, (value, by, _) in zip(plots, PANELS, strict=True):
                 _draw_mean(axes, mine, value, by, method, colour, line)
@@ -386,12 +394,15 @@ def learning_curves(
         for axes, (_, by, heading) in zip(plots, PANELS, strict=True):
             axes.set_title(heading)
             axes.set_xlabel("iteration" if by == "iteration" else "environment steps")
+            axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
             axes.set_ylim(low - 0.06 * (high - low), high + 0.10 * (high - low))
             draw_references(axes, references, named=axes is plots[-1])
         plots[0].set_ylabel("average reward per step")
         handles, labels = plots[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside upper center", ncols=3)
-        figure.suptitle(title, fontweight="bold", x=0.01, ha="left", fontsize=10)
+        legend = figure.legend(
+            handles, labels, loc="outside upper left", ncols=3, title=title, alignment="left"
+        )
+        legend.get_title().set_fontweight("bold")
         figure.supxlabel(source, fontsize=6.5, color=GREY)
     return figure
 

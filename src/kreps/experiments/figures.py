@@ -16,7 +16,7 @@ from kreps.envs.image_swing_up import PIXELS
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.envs.swing_up import TIME_STEP
 from kreps.experiments.cells import commits_of
-from kreps.experiments.specs import TASKS
+from kreps.experiments.specs import METHODS, TASKS
 from kreps.experiments.tables import markdown
 from kreps.policies import BangBang
 from kreps.rollout import simulate, task_of
@@ -145,7 +145,7 @@ def write_figure(
         figure = plotting.comparison(rows, references, TITLES[name], source)
     else:
         some = next(iter(references.values()))
-        figure = plotting.learning_curves(rows, some, TITLES[name], source)
+        figure = plotting.learning_curves(rows, some, TITLES[name], source, list(METHODS))
     picture = plotting.save(figure, folder / f"{name}.png")
     return [folder / f"{name}.{ending}" for ending in ("csv", "json", "md")] + [picture]
 
