@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import re
 import sys
@@ -11,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from kreps.experiments.claims import claims_table, write_claims
-from kreps.experiments.figures import markdown_table
+from kreps.experiments.figures import markdown_table, steps_table
 from kreps.experiments.search import search_table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -67,6 +68,10 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
     assert filled(text) == text
     for name in tables_of(page):
         table = (ROOT / "results" / f"{name}.md").read_text().strip()
+        if name.endswith("-steps"):
+            with open(ROOT / "results" / f"{name.removesuffix('-steps')}.csv", newline="") as file:
+                assert table == steps_table(list(csv.DictReader(file)))
+            continue
         folder = ROOT / ("src/kreps/experiments" if name == "search" else "results")
         content = json.loads((folder / f"{name}.json").read_text())
         if name == "claims":

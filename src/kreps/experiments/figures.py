@@ -121,6 +121,28 @@ def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
     return markdown([*TABLE_HEADINGS, "iterations", "CPU s / update"], rows)
 
 
+MARKS = (2000, 3000, 5000, 8000, 10_000)
+"""Environment steps at which learning curves are read off."""
+
+
+def steps_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Mean and worst seed of each curve at some environment steps, between updates interpolated."""
+    lines = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row for row in rows if row["method"] == method]
+        for name in ("stochastic", "greedy"):
+            line = [f"{method}, {name}"]
+            for mark in MARKS:
+                values = []
+                for seed in sorted({row["seed"] for row in mine}):
+                    curve = [row for row in mine if row["seed"] == seed]
+                    steps = [float(row["steps"]) for row in curve]
+                    values.append(np.interp(mark, steps, [float(row[name]) for row in curve]))
+                line.append(f"{np.mean(values):.1f} ({min(values):.1f})")
+            lines.append(line)
+    return markdown(["mean (worst seed)", *(f"{mark} steps" for mark in MARKS)], lines)
+
+
 TITLES = {
     "figure-1a": "Reaching: learning progress of the methods (Fig. 1a)",
     "figure-1b": "Swing-up: learning progress of the methods (Fig. 1b)",
@@ -139,6 +161,8 @@ def write_figure(
 
     write_results(folder, name, command, results)
     rows = named_rows(rows_of(results))
+    if name == "swing-up":
+        write_atomically(folder / f"{name}-steps.md", (steps_table(rows) + "\n").encode())
     references = {row["method"]: REFERENCE_REWARDS[TASKS[row["task"]].environment] for row in rows}
     source = f"{command}   (commit {commits_of(results)})"
     if name in SEED_BY_SEED:
