@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Any
 
 import numpy as np
@@ -203,3 +204,17 @@ def test_the_window_forgets_the_oldest_rollouts() -> None:
 def test_more_rollouts_than_the_window_holds_leave_the_latest() -> None:
     rollouts = [rollout(1 + i, i) for i in range(5)]
     assert [len(r) for r in Window(2).extend(iter(rollouts)).rollouts] == [4, 5]
+
+
+def test_many_groups_of_angles_are_checked_in_no_time() -> None:
+    many = 20_000
+    started = time.process_time()
+    task = TaskSpec(many, np.zeros(1), np.ones(1), range(many), [[i] for i in range(many)])
+    assert task.factor_count == len(task.state_factors) == many
+    assert time.process_time() - started < 2.0  # each against all took tens of seconds
+
+
+@pytest.mark.parametrize("limit", [1e101, 1.7e308, np.inf])
+def test_absurd_limits_of_actions_are_refused(limit: float) -> None:
+    with pytest.raises(ConfigurationError, match="finite"):
+        TaskSpec(2, np.array([-limit]), np.array([limit]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pickle
@@ -10,8 +11,8 @@ import subprocess
 import sys
 import time
 import tracemalloc
-from collections.abc import Callable, Iterator
-from dataclasses import astuple, fields
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -22,52 +23,42 @@ import safetensors
 import safetensors.numpy
 
 import kreps
-from kreps.algorithms.reps import LearnerState
+from kreps.algorithms.state import LearnerState
 from kreps.data import TaskSpec
 from kreps.errors import StorageError
+from kreps.kernels import Kernel
+from kreps.learner import LEARNERS, Learner
 from kreps.policies import MAX_SUPPORT
+from kreps.storage import POLICY_OF_METHOD
+from kreps.value_policies import LipschitzPolicy
 
 TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
+SETTINGS: dict[str, dict[str, Any]] = {
+    method: {"restart_probability": 0.1, **TINY} for method in LEARNERS
+} | {
+    "grid-value-iteration": {
+        "ranges": ((-3.0, 3.0), (-8.0, 8.0)),
+        "grid_states": 4,
+        "grid_actions": 3,
+    }
+}
 STATES = np.random.default_rng(0).normal(size=(20, 2))
+NOISE = np.random.default_rng(1).normal(size=(20, 1))
 KINDS = ["policy", "checkpoint"]
 
 
-@pytest.fixture(scope="module")
-def learnt() -> kreps.KREPS:
-    env = gym.make("kreps/SwingUp-v0")
-    return kreps.KREPS(env, seed=4, restart_probability=0.1, **TINY).learn(2, progress=False)
+def load(kind: str, path: Path, method: str = "reps") -> Any:
+    return kreps.load_policy(path) if kind == "policy" else LEARNERS[method].resume(path)
 
 
-@pytest.fixture(scope="module")
-def files(learnt: kreps.KREPS, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The bytes of a good file of each kind."""
-    folder = tmp_path_factory.mktemp("good")
-    learnt.policy.save(folder / "policy")
-    learnt.save(folder / "checkpoint")
-    return {kind: (folder / kind).read_bytes() for kind in KINDS}
-
-
-@pytest.fixture(autouse=True)
-def quiet() -> Iterator[None]:
-    """Forged numbers may overflow on the way to being refused."""
-    with np.errstate(all="ignore"):
-        yield
-
-
-def load(kind: str, path: Path) -> Any:
-    return kreps.load_policy(path) if kind == "policy" else kreps.KREPS.resume(path)
-
-
-def refused(kind: str, path: Path) -> str:
-    """The message with which a file is refused; it names the file."""
+def refused(kind: str, path: Path, method: str = "reps") -> str:
+    """The message with which a file is refused: quickly, and naming the file."""
+    started = time.process_time()
     with pytest.raises(StorageError) as caught:
-        load(kind, path)
+        load(kind, path, method)
+    assert time.process_time() - started < 1.0
     assert str(path) in str(caught.value)
     return str(caught.value)
-
-
-def names(folder: Path) -> list[str]:
-    return sorted(path.name for path in folder.iterdir())
 
 
 def parts(content: bytes) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -90,17 +81,105 @@ def raw(path: Path, header: bytes, declared: int | None = None, body: bytes = b"
     return path
 
 
+@dataclass(frozen=True)
+class Good:
+    """A good file, and how files like it are read."""
+
+    method: str
+    kind: str
+    content: bytes
+
+    @property
+    def tensors(self) -> dict[str, Any]:
+        return parts(self.content)[0]
+
+    @property
+    def header(self) -> dict[str, Any]:
+        return parts(self.content)[1]
+
+    def load(self, path: Path) -> Any:
+        return load(self.kind, path, self.method)
+
+    def refused(self, path: Path) -> str:
+        return refused(self.kind, path, self.method)
+
+    def refused_with(
+        self, path: Path, tensors: dict[str, Any] | None = None, header: Any = None
+    ) -> str:
+        """As `refused`, with other arrays or another header."""
+        arrays, known = parts(self.content)
+        forge(path, arrays if tensors is None else tensors, known if header is None else header)
+        return self.refused(path)
+
+
+def good_files(learners: Iterable[Learner[Any]], folder: Path) -> dict[str, Good]:
+    """What learners write, by method and kind."""
+    files = {}
+    for learner in learners:
+        for kind, save in zip(KINDS, (learner.policy.save, learner.save), strict=True):
+            save(folder / kind)
+            content = (folder / kind).read_bytes()
+            files[f"{learner.method} {kind}"] = Good(learner.method, kind, content)
+    return files
+
+
+@pytest.fixture(scope="module")
+def learners() -> dict[str, Learner[Any]]:
+    """One of each method, after two updates."""
+    return {
+        method: LEARNERS[method](gym.make("kreps/SwingUp-v0"), seed=4, **settings).learn(
+            2, progress=False
+        )
+        for method, settings in SETTINGS.items()
+    }
+
+
+@pytest.fixture(params=LEARNERS)
+def learnt(request: pytest.FixtureRequest, learners: dict[str, Learner[Any]]) -> Learner[Any]:
+    return learners[request.param]
+
+
+@pytest.fixture
+def one(learners: dict[str, Learner[Any]]) -> Learner[Any]:
+    """Where the method does not matter."""
+    return learners["npalp"]
+
+
+@pytest.fixture(scope="module")
+def files(
+    learners: dict[str, Learner[Any]], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Good]:
+    return good_files(learners.values(), tmp_path_factory.mktemp("good"))
+
+
+@pytest.fixture(params=[f"{method} {kind}" for method in LEARNERS for kind in KINDS])
+def good(request: pytest.FixtureRequest, files: dict[str, Good]) -> Good:
+    return files[request.param]
+
+
+@pytest.fixture(params=[f"{method} checkpoint" for method in LEARNERS])
+def checkpoint(request: pytest.FixtureRequest, files: dict[str, Good]) -> Good:
+    return files[request.param]
+
+
+@pytest.fixture(autouse=True)
+def quiet() -> Iterator[None]:
+    """Forged numbers may overflow on the way to being refused."""
+    with np.errstate(all="ignore"):
+        yield
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
 # ---- round trips ------------------------------------------------------------------------------
 
 
-def test_a_policy_comes_back_exactly(learnt: kreps.KREPS, tmp_path: Path) -> None:
-    policy = learnt.policy
-    policy.save(tmp_path / "policy.safetensors")
+def test_a_policy_comes_back_exactly(learnt: Learner[Any], tmp_path: Path) -> None:
+    learnt.policy.save(tmp_path / "policy.safetensors")
     again = kreps.load_policy(str(tmp_path / "policy.safetensors"))
-    np.testing.assert_array_equal(again.process.mean(STATES), policy.process.mean(STATES))
-    np.testing.assert_array_equal(
-        again.process.standard_deviation(STATES), policy.process.standard_deviation(STATES)
-    )
+    assert_same_policy(again.process, learnt.policy.process)
     assert again.process.task.periodic == (0,)
     np.testing.assert_array_equal(again.process.task.action_high, [30.0])
     again.save(tmp_path / "again.safetensors")
@@ -110,13 +189,19 @@ def test_a_policy_comes_back_exactly(learnt: kreps.KREPS, tmp_path: Path) -> Non
 
 
 def test_the_seed_of_a_loaded_policy_decides_its_noise(
-    files: dict[str, bytes], tmp_path: Path
+    learnt: Learner[Any], tmp_path: Path
 ) -> None:
-    path = tmp_path / "policy"
-    path.write_bytes(files["policy"])
-    draws = [kreps.load_policy(path, seed=s).predict(STATES)[0] for s in (1, 1, 2)]
+    learnt.policy.save(tmp_path / "policy")
+    draws = [kreps.load_policy(tmp_path / "policy", seed=s).predict(STATES)[0] for s in (1, 1, 2)]
     np.testing.assert_array_equal(draws[0], draws[1])
-    assert not np.array_equal(draws[0], draws[2])
+    explores = learnt.method != "grid-value-iteration"
+    assert np.array_equal(draws[0], draws[2]) != explores
+
+
+def assert_same_policy(a: Any, b: Any) -> None:
+    assert type(a) is type(b)
+    np.testing.assert_array_equal(a.greedy(STATES), b.greedy(STATES))
+    np.testing.assert_array_equal(a.act(STATES, NOISE), b.act(STATES, NOISE))
 
 
 def assert_same_state(a: LearnerState, b: LearnerState) -> None:
@@ -129,26 +214,28 @@ def assert_same_state(a: LearnerState, b: LearnerState) -> None:
         assert mine.terminated == theirs.terminated
     for name in ("policy_start", "embedding_start"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    assert (a.policy is None) == (b.policy is None)
     if a.policy is not None:
-        assert b.policy is not None and a.value is not None and b.value is not None
-        np.testing.assert_array_equal(a.policy.mean(STATES), b.policy.mean(STATES))
+        assert_same_policy(a.policy, b.policy)
+    assert (a.value is None) == (b.value is None)
+    if a.value is not None and b.value is not None:
         np.testing.assert_array_equal(a.value(STATES), b.value(STATES))
 
 
-def test_a_checkpoint_comes_back_exactly(learnt: kreps.KREPS, tmp_path: Path) -> None:
+def test_a_checkpoint_comes_back_exactly(learnt: Learner[Any], tmp_path: Path) -> None:
     learnt.save(tmp_path / "one")
-    again = kreps.KREPS.resume(tmp_path / "one")
-    assert again.seed == 4
-    assert astuple(again.settings) == astuple(learnt.settings)
+    again = type(learnt).resume(tmp_path / "one")
+    assert type(again) is type(learnt) and again.seed == 4
+    assert again.settings == learnt.settings
     assert again.task.periodic == (0,)
     assert_same_state(learnt.state, again.state)
     again.save(tmp_path / "two")
     assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
 
 
-def test_a_checkpoint_leaves_out_nothing_of_the_state(learnt: kreps.KREPS) -> None:
+def test_a_checkpoint_leaves_out_nothing_of_the_state() -> None:
     # a new field of the state must be written, and compared above
-    assert {f.name for f in fields(learnt.state)} == {
+    assert {f.name for f in fields(LearnerState)} == {
         "window",
         "iteration",
         "rollouts",
@@ -160,11 +247,12 @@ def test_a_checkpoint_leaves_out_nothing_of_the_state(learnt: kreps.KREPS) -> No
     }
 
 
-def test_a_learner_that_has_learnt_nothing_can_be_saved(tmp_path: Path) -> None:
-    learner = kreps.KREPS(TaskSpec(3, [-1.0, 0.0], [1.0, 5.0], (2,)), seed=9, kl_bound=0.3)
+@pytest.mark.parametrize("method", LEARNERS)
+def test_a_learner_that_has_learnt_nothing_can_be_saved(method: str, tmp_path: Path) -> None:
+    learner = LEARNERS[method](TaskSpec(3, [-1.0, 0.0], [1.0, 5.0], (2,)), seed=9, window=7)
     learner.save(tmp_path / "fresh")
-    again = kreps.KREPS.resume(tmp_path / "fresh")
-    assert again.seed == 9 and again.settings.kl_bound == 0.3
+    again = LEARNERS[method].resume(tmp_path / "fresh")
+    assert again.seed == 9 and again.settings.window == 7
     assert again.task.observation_size == 3 and again.task.periodic == (2,)
     assert_same_state(learner.state, again.state)
 
@@ -195,39 +283,118 @@ def test_real_ends_survive_a_checkpoint(tmp_path: Path) -> None:
     assert [len(r) for r in again.state.window.rollouts] == [4, 1, 7]
 
 
-def test_files_hold_no_code(files: dict[str, bytes]) -> None:
-    for content in files.values():
-        tensors, header = parts(content)
-        assert all(values.dtype == np.float64 for values in tensors.values())
-        assert set(header) >= {"kind", "version", "task"}
+def test_files_hold_no_code(good: Good) -> None:
+    assert all(values.dtype == np.float64 for values in good.tensors.values())
+    assert set(good.header) >= {"kind", "version", "task", "policy"}
+    assert good.header["policy"] == POLICY_OF_METHOD[good.method]
+
+
+# ---- images -----------------------------------------------------------------------------------
+
+
+def image_task(height: int, width: int) -> TaskSpec:
+    pixels = height * width
+    return TaskSpec(pixels, [-1.0], [1.0], (), (tuple(range(pixels)),), (height, width))
+
+
+@pytest.fixture(scope="module")
+def watching() -> dict[str, Learner[Any]]:
+    """One of each method, which has seen a few images of 100 x 100."""
+    rng, task = np.random.default_rng(6), image_task(100, 100)
+    rollouts = [
+        kreps.Rollout(rng.random((4, 10_000)), rng.normal(size=(3, 1)), rng.normal(size=3))
+        for _ in range(2)
+    ]
+    learners = {method: learner(task) for method, learner in LEARNERS.items()}
+    for learner in learners.values():
+        learner.update(rollouts)
+    return learners
+
+
+@pytest.fixture(scope="module")
+def pictures(
+    watching: dict[str, Learner[Any]], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Good]:
+    return good_files(watching.values(), tmp_path_factory.mktemp("pictures"))
+
+
+@pytest.mark.parametrize("method", LEARNERS)
+def test_a_task_of_large_images_comes_back_exactly(
+    method: str, watching: dict[str, Learner[Any]], tmp_path: Path
+) -> None:
+    learner, images = watching[method], np.random.default_rng(7).random((3, 10_000))
+    for file in good_files([learner], tmp_path).values():
+        again = file.load(tmp_path / file.kind)
+        process = again.process if file.kind == "policy" else again.state.policy
+        assert process.task.image_shape == (100, 100)
+        assert process.task.groups == learner.task.groups
+        np.testing.assert_array_equal(
+            process.act(images, NOISE[:3]), learner.policy.process.act(images, NOISE[:3])
+        )
+        again.save(tmp_path / "again")
+        assert (tmp_path / "again").read_bytes() == file.content
+
+
+SHAPES: list[Any] = [
+    [1, 100_000],
+    [100_000, 1],
+    [1, 1_000],
+    [-100, -100],
+    [-1, -10_000],
+    [0, 0],
+    ["100", "100"],
+    [100.0, 100.0],
+    [100, None],
+    [1e999, 100],
+    [[100], [100]],
+    [100, 100, 1],
+    [10_000],
+    [2**70, 2**70],
+    [1] * 10_000,
+    "ab",
+    100,
+    {},
+    True,
+]
+
+
+@pytest.mark.parametrize("shape", SHAPES, ids=lambda shape: f"{shape!r:.16}")
+def test_forged_shapes_of_images_are_refused(
+    shape: Any, pictures: dict[str, Good], tmp_path: Path
+) -> None:
+    for file in pictures.values():
+        header = file.header
+        header["task"]["image_shape"] = shape
+        message = file.refused_with(tmp_path / "x", header=header)
+        assert "image_shape" in message
 
 
 # ---- writing ----------------------------------------------------------------------------------
 
 
-def test_saving_leaves_only_the_file(learnt: kreps.KREPS, tmp_path: Path) -> None:
+def test_saving_leaves_only_the_file(one: Learner[Any], tmp_path: Path) -> None:
     for _ in range(2):  # anew and over an old one
-        learnt.policy.save(tmp_path / "policy")
-        learnt.save(tmp_path / "checkpoint")
+        one.policy.save(tmp_path / "policy")
+        one.save(tmp_path / "checkpoint")
         assert names(tmp_path) == ["checkpoint", "policy"]
 
 
 def test_saving_where_a_folder_stands_is_an_error_that_leaves_nothing_behind(
-    learnt: kreps.KREPS, tmp_path: Path
+    one: Learner[Any], tmp_path: Path
 ) -> None:
     (tmp_path / "there").mkdir()
     with pytest.raises(StorageError, match="there"):
-        learnt.policy.save(tmp_path / "there")
+        one.policy.save(tmp_path / "there")
     assert names(tmp_path) == ["there"]
 
 
 @pytest.mark.parametrize("where", ["missing/policy", "file/policy", "x" * 300, "", "nul\0byte"])
 def test_saving_where_nothing_can_be_written_is_an_error_of_the_library(
-    learnt: kreps.KREPS, tmp_path: Path, where: str
+    one: Learner[Any], tmp_path: Path, where: str
 ) -> None:
     (tmp_path / "file").write_text("not a folder")
     path = str(tmp_path / where) if where else where
-    for save in (learnt.policy.save, learnt.save):
+    for save in (one.policy.save, one.save):
         with pytest.raises(StorageError):
             save(path)
     assert names(tmp_path) == ["file"]
@@ -235,7 +402,7 @@ def test_saving_where_nothing_can_be_written_is_an_error_of_the_library(
 
 @pytest.mark.parametrize("failing", ["fsync", "replace"])
 def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_behind(
-    learnt: kreps.KREPS, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+    one: Learner[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
     path = tmp_path / "policy"
     path.write_bytes(b"the old content")
@@ -246,56 +413,75 @@ def test_a_failed_write_keeps_the_old_file_and_leaves_nothing_behind(
     with monkeypatch.context() as patch:
         patch.setattr(os, failing, no_space)
         with pytest.raises(StorageError, match="No space left"):
-            learnt.policy.save(path)
+            one.policy.save(path)
     assert path.read_bytes() == b"the old content"
     assert names(tmp_path) == ["policy"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write anywhere")
-def test_a_folder_without_permission_keeps_the_old_file(
-    learnt: kreps.KREPS, tmp_path: Path
-) -> None:
+def test_a_folder_without_permission_keeps_the_old_file(one: Learner[Any], tmp_path: Path) -> None:
     path = tmp_path / "policy"
     path.write_bytes(b"the old content")
     tmp_path.chmod(0o500)
     try:
         with pytest.raises(StorageError, match="Permission denied"):
-            learnt.policy.save(path)
+            one.policy.save(path)
     finally:
         tmp_path.chmod(0o700)
     assert path.read_bytes() == b"the old content"
 
 
+def test_a_header_too_large_to_be_read_back_is_refused_when_it_is_written(tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(b"the old content")
+    for save in (_policy_of_images(600, 500).save, kreps.KREPS(image_task(600, 500)).save):
+        with pytest.raises(StorageError, match="header") as caught:
+            save(path)
+        assert str(path) in str(caught.value)
+        assert path.read_bytes() == b"the old content"
+        assert names(tmp_path) == ["x"]
+
+
+def test_a_header_that_is_just_small_enough_is_read_back(tmp_path: Path) -> None:
+    policy = _policy_of_images(512, 512)
+    policy.save(tmp_path / "one")
+    assert len(json.dumps(parts((tmp_path / "one").read_bytes())[1])) > 0.9 * 2**21
+    again = kreps.load_policy(tmp_path / "one")
+    assert again.process.task.image_shape == (512, 512)
+    again.save(tmp_path / "two")
+    assert (tmp_path / "one").read_bytes() == (tmp_path / "two").read_bytes()
+
+
+def _policy_of_images(height: int, width: int) -> kreps.Policy:
+    task = image_task(height, width)
+    states, kernel = np.zeros((1, height * width)), Kernel(task.state_factors, np.ones(1))
+    actions, bounds = np.zeros((1, 1)), np.zeros(1)
+    return kreps.Policy(LipschitzPolicy(task, kernel, states, actions, bounds, 1.0, 0.3, 0.3))
+
+
 # ---- damaged files ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_truncated_file_is_refused_at_every_length(
-    kind: str, files: dict[str, bytes], tmp_path: Path
-) -> None:
-    content, path = files[kind], tmp_path / "cut"
-    lengths = {*range(17), *np.linspace(17, len(content) - 1, 60).astype(int).tolist()}
+def test_a_truncated_file_is_refused_at_every_length(good: Good, tmp_path: Path) -> None:
+    content, path = good.content, tmp_path / "cut"
+    lengths = {*range(0, 17, 4), *np.linspace(17, len(content) - 1, 30).astype(int).tolist()}
     for length in sorted(lengths):
         path.write_bytes(content[:length])
-        refused(kind, path)
+        good.refused(path)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_an_overlong_file_is_refused(kind: str, files: dict[str, bytes], tmp_path: Path) -> None:
+def test_an_overlong_file_is_refused(good: Good, tmp_path: Path) -> None:
     path = tmp_path / "long"
-    path.write_bytes(files[kind] + b"\0" * 8)
-    refused(kind, path)
+    path.write_bytes(good.content + b"\0" * 8)
+    good.refused(path)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_flipped_bytes_are_refused_or_harmless(
-    kind: str, files: dict[str, bytes], tmp_path: Path
-) -> None:
-    content, path = files[kind], tmp_path / "flipped"
+def test_flipped_bytes_are_refused_or_harmless(good: Good, tmp_path: Path) -> None:
+    content, path = good.content, tmp_path / "flipped"
     (size,) = struct.unpack("<Q", content[:8])
     rng = np.random.default_rng(7)
     outcomes = {"refused": 0, "loaded": 0}
-    for trial in range(240):
+    for trial in range(100):
         # a third each in the header, in any byte of a number, and in its exponent
         body = rng.integers(8 + size, len(content))
         exponent = 8 + size + 8 * ((body - 8 - size) // 8) + rng.choice([6, 7])
@@ -304,16 +490,19 @@ def test_flipped_bytes_are_refused_or_harmless(
         damaged[where] ^= int(rng.integers(1, 256))
         path.write_bytes(damaged)
         try:
-            loaded = load(kind, path)
+            loaded = good.load(path)
         except StorageError:
             outcomes["refused"] += 1
             continue
         outcomes["loaded"] += 1
-        policy = loaded if kind == "policy" else loaded.policy
-        for deterministic in (True, False):
-            actions, _ = policy.predict(STATES, deterministic=deterministic)
-            assert np.isfinite(actions).all(), f"byte {where}"
+        assert_finite(loaded, f"byte {where}")
     assert min(outcomes.values()) > 20  # both happen, or this would show nothing
+
+
+def assert_finite(loaded: Any, what: str) -> None:
+    for deterministic in (True, False):
+        actions, _ = loaded.predict(STATES, deterministic=deterministic)
+        assert np.isfinite(actions).all(), what
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -361,119 +550,147 @@ def test_paths_that_are_no_files_are_refused(kind: str, tmp_path: Path) -> None:
     refused(kind, tmp_path / ("x" * 300))
 
 
-def test_other_safetensors_files_are_refused(files: dict[str, bytes], tmp_path: Path) -> None:
-    tensors, header = parts(files["policy"])
+def test_other_safetensors_files_are_refused(good: Good, tmp_path: Path) -> None:
     path = tmp_path / "foreign"
-    path.write_bytes(safetensors.numpy.save(tensors))
-    assert "another program" in refused("policy", path)
-    forge(path, tensors, header, key="other")
-    assert "another program" in refused("policy", path)
+    path.write_bytes(safetensors.numpy.save(good.tensors))
+    assert "another program" in good.refused(path)
+    forge(path, good.tensors, good.header, key="other")
+    assert "another program" in good.refused(path)
 
 
-def test_a_checkpoint_is_no_policy_and_the_other_way_round(
-    files: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_a_checkpoint_is_no_policy_and_the_other_way_round(good: Good, tmp_path: Path) -> None:
     path = tmp_path / "x"
-    path.write_bytes(files["checkpoint"])
-    assert "it is a kreps checkpoint" in refused("policy", path)
-    path.write_bytes(files["policy"])
-    assert "it is a kreps policy" in refused("checkpoint", path)
+    path.write_bytes(good.content)
+    (other,) = {*KINDS} - {good.kind}
+    assert f"it is a kreps {good.kind}" in refused(other, path, good.method)
+
+
+def test_a_checkpoint_is_only_for_its_method(checkpoint: Good, tmp_path: Path) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(checkpoint.content)
+    for method in LEARNERS.keys() - {checkpoint.method}:
+        assert f"method {checkpoint.method}" in refused("checkpoint", path, method)
+    for method in (None, [], {}, 7, "", checkpoint.method.upper()):
+        header = {**checkpoint.header, "method": method}
+        assert "method" in checkpoint.refused_with(path, header=header)
 
 
 @pytest.mark.parametrize("version", [0, 1, 3, -1, "2", None, 1e300, [2]])
 def test_another_version_is_refused_with_its_remedy(
-    version: Any, files: dict[str, bytes], tmp_path: Path
+    version: Any, files: dict[str, Good], tmp_path: Path
 ) -> None:
-    for kind in KINDS:
-        tensors, header = parts(files[kind])
-        path = forge(tmp_path / kind, tensors, {**header, "version": version})
-        assert "version" in refused(kind, path)
+    for name, file in files.items():
+        header = {**file.header, "version": version}
+        assert "version" in file.refused_with(tmp_path / name, header=header)
 
 
-def test_a_missing_version_is_refused(files: dict[str, bytes], tmp_path: Path) -> None:
-    tensors, header = parts(files["policy"])
-    del header["version"]
-    refused("policy", forge(tmp_path / "x", tensors, header))
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_one_nan_or_infinity_in_any_array_is_refused(
-    kind: str, value: float, files: dict[str, bytes], tmp_path: Path
-) -> None:
-    tensors, header = parts(files[kind])
-    for name in tensors:
+def test_one_nan_or_infinity_in_any_array_is_refused(good: Good, tmp_path: Path) -> None:
+    tensors = good.tensors
+    for name, value in itertools.product(tensors, (np.nan, np.inf, -np.inf)):
         spoilt = {**tensors, name: tensors[name].copy()}
         spoilt[name].flat[-1] = value
-        assert name in refused(kind, forge(tmp_path / "x", spoilt, header))
+        assert name in good.refused_with(tmp_path / "x", spoilt)
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_array_is_needed_in_its_shape(
-    kind: str, files: dict[str, bytes], tmp_path: Path
-) -> None:
-    tensors, header = parts(files[kind])
+OPTIONAL = {"window.lengths", "start.embedding", "start.policy"}
+"""Arrays that a checkpoint may be without: before anything was learnt, or in some methods."""
+
+
+def test_every_array_is_needed_in_its_shape(good: Good, tmp_path: Path) -> None:
+    tensors, header = parts(good.content)
     path = tmp_path / "x"
     for name, values in tensors.items():
         others = {n: v for n, v in tensors.items() if n != name}
-        assert name in refused(kind, forge(path, others, header))
-        for wrong in (values[:-1], values[None], values.ravel()[:0], np.float64(1.0)):
-            assert "shape" in (
-                m := refused(kind, forge(path, {**others, name: wrong}, header))
-            ) or ("do not fit" in m or "no support point" in m)
+        assert name in good.refused_with(path, others)
+        if name not in OPTIONAL:
+            assert name in good.refused_with(path, others, {**header, "arrays": sorted(others)})
+        wide = np.concatenate([values, values], axis=-1)
+        for wrong in (wide, values[:-1], values[None], values.ravel()[:0], np.float64(1.0)):
+            message = good.refused_with(path, {**others, name: wrong})
+            assert any(said in message for said in ("shape", "do not fit", "no support point"))
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_other_number_types_are_refused(kind: str, files: dict[str, bytes], tmp_path: Path) -> None:
-    tensors, header = parts(files[kind])
+def test_a_checkpoint_of_reps_without_its_values_is_refused(
+    files: dict[str, Good], tmp_path: Path
+) -> None:
+    file = files["reps checkpoint"]
+    tensors = {n: v for n, v in file.tensors.items() if not n.startswith("value.")}
+    header = {**file.header, "arrays": sorted(tensors)}
+    assert "'value." in file.refused_with(tmp_path / "x", tensors, header)
+
+
+def test_other_number_types_are_refused(good: Good, tmp_path: Path) -> None:
+    tensors = good.tensors
     for dtype in (np.float32, np.int64, np.float16, np.bool_):
         narrow = {name: values.astype(dtype) for name, values in tensors.items()}
-        assert "64-bit" in refused(kind, forge(tmp_path / "x", narrow, header))
-    one = next(iter(tensors))
-    mixed = {**tensors, one: tensors[one].astype(np.float32)}
-    assert one in refused(kind, forge(tmp_path / "x", mixed, header))
+        assert "64-bit" in good.refused_with(tmp_path / "x", narrow)
+    for one in tensors:
+        mixed = {**tensors, one: tensors[one].astype(np.float32)}
+        assert one in good.refused_with(tmp_path / "x", mixed)
 
 
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("policy.lengthscales", lambda v: -v),
-        ("policy.lengthscales", lambda v: 0 * v),
-        ("policy.lengthscales", lambda v: 1e-320 * v),
-        ("policy.weights", lambda v: -v),
-        ("policy.weights", lambda v: 0 * v),
-        ("policy.signal_and_noise", lambda v: -v),
-        ("policy.signal_and_noise", lambda v: v * [1, 0]),
-        ("policy.signal_and_noise", lambda v: v * [0, 1]),
-    ],
-)
+def put(where: int, value: float) -> Callable[[Any], Any]:
+    """A change of one number of a vector."""
+    return lambda v: np.where(np.arange(len(v)) == where, value, v)
+
+
+def none_of(*changed: str) -> dict[str, Callable[[Any], Any]]:
+    return {f"policy.{name}": lambda v: v[:0] for name in changed}
+
+
+IMPOSSIBLE: dict[str, dict[str, Callable[[Any], Any]]] = {
+    "negative lengthscales": {"policy.lengthscales": lambda v: -v},
+    "no lengthscales": {"policy.lengthscales": lambda v: 0 * v},
+    "tiny lengthscales": {"policy.lengthscales": lambda v: 1e-320 * v},
+    "huge lengthscales": {"policy.lengthscales": put(0, 1e60)},
+    "negative lengthscales of V": {"value.lengthscales": lambda v: -v},
+    "tiny lengthscales of V": {"value.lengthscales": put(1, 1e-60)},
+    "no samples of a process": none_of("states", "targets", "weights"),
+    "no samples of a softmax": none_of("states", "table"),
+    "no samples of slopes": none_of("states", "actions", "bounds"),
+    "negative weights": {"policy.weights": lambda v: -v},
+    "one weight of zero": {"policy.weights": put(0, 0.0)},
+    "negative variances": {"policy.signal_and_noise": lambda v: -v},
+    "no noise": {"policy.signal_and_noise": put(1, 0.0)},
+    "no signal": {"policy.signal_and_noise": put(0, 0.0)},
+    "no candidates": {**none_of("candidates"), "policy.table": lambda v: v[:, :0]},
+    **{
+        f"temperature {t}": {"policy.offset_and_temperature": put(1, t)}
+        for t in (-1.0, -1e-300, 1e-300, 5e-324, np.nan, np.inf)
+    },
+    "offset of NaN": {"policy.offset_and_temperature": put(0, np.nan)},
+    "negative slope": {"policy.slope_and_noise": put(0, -1e-300)},
+    **{
+        f"noise fraction {f}": {"policy.slope_and_noise": put(1, f)}
+        for f in (-0.1, -1e-300, np.nextafter(1.0, 2.0), 2.0, 1e99, np.nan)
+    },
+    "negative noise": {"policy.slope_and_noise": put(2, -1.0)},
+    "no noise scale": {"policy.slope_and_noise": put(2, np.nan)},
+}
+
+
+@pytest.mark.parametrize("changes", IMPOSSIBLE.values(), ids=IMPOSSIBLE)
 def test_impossible_parameters_are_refused(
-    name: str, change: Callable[[Any], Any], files: dict[str, bytes], tmp_path: Path
+    changes: dict[str, Callable[[Any], Any]], files: dict[str, Good], tmp_path: Path
 ) -> None:
-    for kind in KINDS:
-        tensors, header = parts(files[kind])
-        assert name in tensors
-        path = forge(tmp_path / kind, {**tensors, name: change(tensors[name])}, header)
-        refused(kind, path)
+    concerned = {name: file for name, file in files.items() if changes.keys() <= {*file.tensors}}
+    assert concerned
+    for name, file in concerned.items():
+        tensors = file.tensors
+        changed = {array: change(tensors[array]) for array, change in changes.items()}
+        file.refused_with(tmp_path / name, {**tensors, **changed})
 
 
-def test_a_policy_that_would_answer_nan_is_refused(tmp_path: Path) -> None:
-    # finite numbers all, but the distances of the states overflow
-    header = {"kind": "policy", "version": 2, "task": _task(2)}
-    tensors = {
-        "policy.lengthscales": np.array([1e-200, 1e-200]),
-        "policy.states": np.array([[1e150, -1e150]]),
-        "policy.targets": np.array([[1e308]]),
-        "policy.weights": np.array([1.0]),
-        "policy.signal_and_noise": np.array([1.0, 1e-300]),
-    }
-    path = forge(tmp_path / "x", tensors, header)
-    try:
-        policy = kreps.load_policy(path)
-    except StorageError:
-        return
-    actions, _ = policy.predict(STATES, deterministic=True)
-    assert np.isfinite(actions).all()
+def test_extreme_numbers_are_refused_or_harmless(good: Good, tmp_path: Path) -> None:
+    tensors = good.tensors
+    arrays = [name for name in tensors if name.startswith("policy.")]
+    for name, value in itertools.product(arrays, (1e100, -1e100, 1e-300, -1e-300, 0.0)):
+        changed = {**tensors, name: np.full_like(tensors[name], value)}
+        try:
+            loaded = good.load(forge(tmp_path / "x", changed, good.header))
+        except StorageError:
+            continue
+        assert_finite(loaded, f"{name} = {value}")
 
 
 @pytest.mark.parametrize(
@@ -482,14 +699,14 @@ def test_a_policy_that_would_answer_nan_is_refused(tmp_path: Path) -> None:
     ids=["zero", "negative", "half", "1e99", "1e18"],
 )
 def test_impossible_lengths_of_rollouts_are_refused(
-    lengths: list[float], files: dict[str, bytes], tmp_path: Path
+    lengths: list[float], checkpoint: Good, tmp_path: Path
 ) -> None:
-    tensors, header = parts(files["checkpoint"])
+    tensors = checkpoint.tensors
     changed = tensors["window.lengths"].copy()
     changed[0] += changed[1] - lengths[0]  # the sum stays right
     changed[1] = lengths[0]
-    path = forge(tmp_path / "x", {**tensors, "window.lengths": changed}, header)
-    assert "lengths of its roll-outs" in refused("checkpoint", path)
+    message = checkpoint.refused_with(tmp_path / "x", {**tensors, "window.lengths": changed})
+    assert "lengths of its roll-outs" in message
 
 
 # ---- hostile headers --------------------------------------------------------------------------
@@ -505,6 +722,11 @@ def _task(observation_size: Any = 2, **changes: Any) -> dict[str, Any]:
         "image_shape": None,
     }
     return {**task, **changes}
+
+
+def test_the_forgeries_below_start_from_what_can_be_read(good: Good, tmp_path: Path) -> None:
+    path = forge(tmp_path / "x", good.tensors, {**good.header, "task": _task()})
+    assert_finite(good.load(path), good.kind)
 
 
 @pytest.mark.parametrize(
@@ -534,12 +756,69 @@ def _task(observation_size: Any = 2, **changes: Any) -> dict[str, Any]:
         _task(periodic=0),
         _task(periodic=["x"]),
         _task(periodic=[1e999]),
+        _task(groups=0),
+        _task(groups=[0, 1]),
+        _task(groups=["ab"]),
+        _task(groups=[[0, 1]]),
+        _task(groups=[[0], [0]]),
+        _task(groups=[[-1]]),
+        _task(groups=[[2]]),
+        _task(groups=[[0.0]]),
+        _task(groups=[[1e999]]),
+        _task(groups=[list(range(100_000))]),
+        _task(image_shape=[1, 2]),
+        _task(image_shape=[1, 1], groups=[[0]]),
+        _task(image_shape=[1, 2], groups=[[0, 1]]),
+        _task(image_shape=[1, 100_000], groups=[list(range(100_000))]),
+    ],
+    ids=lambda task: f"{task!r:.120}",
+)
+def test_forged_tasks_are_refused(task: Any, files: dict[str, Good], tmp_path: Path) -> None:
+    for name, file in files.items():
+        file.refused_with(tmp_path / name, header={**file.header, "task": task})
+
+
+ABSENT = object()
+
+
+@pytest.mark.parametrize(
+    ("field", "values", "said"),
+    [
+        ("kind", [ABSENT], "another program"),
+        ("kind", ["", "Policy", None, 7, ["policy"], {}], "it is a kreps"),
+        ("version", [ABSENT], "version"),
+        ("arrays", [ABSENT, None, 7, "policy.states", {"policy.states": 1}], "name its arrays"),
+        ("arrays", [["x"], [None], [[]], ["policy.states", {}]], "is missing"),
+        ("task", [ABSENT], "task"),
+        ("policy", [ABSENT, None, 7, [], {}, "", "Softmax", "gp", "x" * 1000], ""),
     ],
 )
-def test_forged_tasks_are_refused(task: Any, files: dict[str, bytes], tmp_path: Path) -> None:
-    for kind in KINDS:
-        tensors, header = parts(files[kind])
-        refused(kind, forge(tmp_path / kind, tensors, {**header, "task": task}))
+def test_forged_fields_are_refused(
+    field: str, values: list[Any], said: str, files: dict[str, Good], tmp_path: Path
+) -> None:
+    for (name, file), value in itertools.product(files.items(), values):
+        header = {**file.header, field: value}
+        if value is ABSENT:
+            del header[field]
+        assert said in file.refused_with(tmp_path / name, header=header)
+
+
+def test_a_policy_of_another_kind_is_refused(good: Good, tmp_path: Path) -> None:
+    for kind in {*POLICY_OF_METHOD.values()} - {good.header["policy"]}:
+        good.refused_with(tmp_path / "x", header={**good.header, "policy": kind})
+
+
+def test_a_checkpoint_with_a_policy_that_its_method_does_not_learn_is_refused(
+    checkpoint: Good, files: dict[str, Good], tmp_path: Path
+) -> None:
+    own = {n: v for n, v in checkpoint.tensors.items() if not n.startswith("policy.")}
+    kind = POLICY_OF_METHOD[checkpoint.method]
+    for method in (m for m in LEARNERS if POLICY_OF_METHOD[m] != kind):
+        lent = files[f"{method} policy"]
+        tensors = {**own, **lent.tensors}
+        changes = {"policy": POLICY_OF_METHOD[method], "arrays": sorted(tensors)}
+        message = checkpoint.refused_with(tmp_path / "x", tensors, {**checkpoint.header, **changes})
+        assert "does not learn" in message
 
 
 @pytest.mark.parametrize(
@@ -562,25 +841,49 @@ def test_forged_tasks_are_refused(task: Any, files: dict[str, bytes], tmp_path: 
     ],
 )
 def test_forged_checkpoints_are_refused(
-    changes: dict[str, Any], files: dict[str, bytes], tmp_path: Path
+    changes: dict[str, Any], files: dict[str, Good], tmp_path: Path
 ) -> None:
-    tensors, header = parts(files["checkpoint"])
-    refused("checkpoint", forge(tmp_path / "x", tensors, {**header, **changes}))
+    for method in LEARNERS:
+        file = files[f"{method} checkpoint"]
+        file.refused_with(tmp_path / method, header={**file.header, **changes})
+
+
+@pytest.mark.parametrize(
+    ("method", "name", "values"),
+    [
+        ("reps", "kl_bound", [0, -1, np.nan, np.inf, "1", None, True]),
+        ("reps", "model", ["", None, ["sample"]]),
+        ("value-iteration", "temperature", [0, -1, np.nan, "1"]),
+        ("value-iteration", "actions", [0, -1, 2.5]),
+        ("grid-value-iteration", "temperature", [0.0, 1.0]),  # it has none
+        ("grid-value-iteration", "ranges", ["ab", 7, [[1, 0]], [[0, 1, 2]], [[np.nan, 1]]]),
+        ("npalp", "noise_fraction", [-0.1, 1.1, np.nan, None]),
+        ("npalp", "lipschitz", [0, -1, np.inf]),
+        *((method, "window", [0, -1, 1.5, None, True]) for method in LEARNERS),
+    ],
+)
+def test_forged_settings_are_refused(
+    method: str, name: str, values: list[Any], files: dict[str, Good], tmp_path: Path
+) -> None:
+    file = files[f"{method} checkpoint"]
+    for value in values:
+        settings = {**file.header["settings"], name: value}
+        message = file.refused_with(tmp_path / "x", header={**file.header, "settings": settings})
+        assert name in message
 
 
 @pytest.mark.parametrize(
     "text",
     ["", "null", "7", "[]", '"policy"', "{}", '{"kind": []}', "{" * 10, "nan", "[" * 100_000],
 )
-def test_forged_headers_are_refused(text: str, files: dict[str, bytes], tmp_path: Path) -> None:
-    tensors, _ = parts(files["policy"])
-    refused("policy", forge(tmp_path / "x", tensors, text))
+def test_forged_headers_are_refused(text: str, files: dict[str, Good], tmp_path: Path) -> None:
+    for name, file in files.items():
+        file.refused_with(tmp_path / name, header=text)
 
 
-def test_deeply_nested_json_is_refused(files: dict[str, bytes], tmp_path: Path) -> None:
-    tensors, _ = parts(files["policy"])
+def test_deeply_nested_json_is_refused(files: dict[str, Good], tmp_path: Path) -> None:
     nested = '{"kind": "policy", "version": 2, "task": ' + '{"a":' * 40_000 + "1" + "}" * 40_001
-    refused("policy", forge(tmp_path / "x", tensors, nested))
+    files["reps policy"].refused_with(tmp_path / "x", header=nested)
     refused("policy", raw(tmp_path / "y", b'{"a":' * 30_000 + b"1" + b"}" * 30_000))
 
 
@@ -617,15 +920,11 @@ def test_arrays_that_lie_about_their_place_are_refused(
     refused("policy", raw(tmp_path / "x", header, body=b"\0" * 8))
 
 
-def test_a_file_of_three_gibibytes_is_refused_at_once(
-    files: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_a_file_of_three_gibibytes_is_refused_at_once(good: Good, tmp_path: Path) -> None:
     path = tmp_path / "sparse"
-    path.write_bytes(files["policy"])
+    path.write_bytes(good.content)
     os.truncate(path, 3 * 2**30)
-    started = time.process_time()
-    assert "limit" in refused("policy", path)
-    assert time.process_time() - started < 0.5
+    assert "limit" in good.refused(path)
 
 
 def test_too_many_support_points_are_refused_at_once(tmp_path: Path) -> None:
@@ -703,10 +1002,8 @@ except kreps.StorageError:
 # ---- resuming in another environment ----------------------------------------------------------
 
 
-def test_resuming_in_another_environment_is_refused(
-    files: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_resuming_in_another_environment_is_refused(checkpoint: Good, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint"
-    path.write_bytes(files["checkpoint"])
+    path.write_bytes(checkpoint.content)
     with pytest.raises(kreps.ConfigurationError, match="learnt in"):
-        kreps.KREPS.resume(path, gym.make("Pendulum-v1"))
+        LEARNERS[checkpoint.method].resume(path, gym.make("Pendulum-v1"))

@@ -70,7 +70,7 @@ class TaskSpec:
                 f"action limits have shapes {low.shape} and {high.shape}; "
                 "give two vectors of the same positive length"
             )
-        if not (np.isfinite(low).all() and np.isfinite(high).all() and (low < high).all()):
+        if not (is_sane(low).all() and is_sane(high).all() and (low < high).all()):
             raise ConfigurationError(
                 f"action limits {low} to {high} must be finite and low < high; "
                 "the policy needs a scale for its actions, so give a bounded range"
@@ -78,10 +78,12 @@ class TaskSpec:
         grouped = [i for group in self.groups for i in group]
         if len(set(grouped)) < len(grouped):
             raise ConfigurationError("a coordinate is in two groups; it has one lengthscale")
-        mixed = [g for g in self.groups if 0 < len(set(g) & set(self.periodic)) < len(g)]
+        angles = set(self.periodic)
+        mixed = [g for g in self.groups if 0 < len(angles.intersection(g)) < len(g)]
         if mixed:
             raise ConfigurationError(
-                f"the group {mixed[0]} mixes angles and other coordinates, which share no scale"
+                f"the group {mixed[0]!s:.60} mixes angles and other coordinates, which share "
+                "no scale"
             )
         if self.image_shape is not None:
             try:
@@ -99,14 +101,14 @@ class TaskSpec:
             ):
                 raise ConfigurationError(
                     f"image_shape = {self.image_shape}, but the groups have "
-                    f"{[len(group) for group in self.groups]} of {self.observation_size} "
+                    f"{[len(group) for group in self.groups]!s:.60} of {self.observation_size} "
                     f"coordinates; each must be an image of {height} x {width}, and all in one"
                 )
         named = (*self.periodic, *grouped)
         outside = [i for i in named if not 0 <= i < self.observation_size]
         if outside:
             raise ConfigurationError(
-                f"periodic or grouped coordinates {outside} do not exist: observations have "
+                f"periodic or grouped coordinates {outside!s:.60} do not exist: observations have "
                 f"{self.observation_size} coordinates, numbered from 0"
             )
 

@@ -98,11 +98,12 @@ def factors_of(
     """
     if image_shape is not None:
         return tuple(SmoothedImage(tuple(group), image_shape) for group in groups)
+    angles = set(periodic)
     grouped = {i for group in groups for i in group}
     parts = [tuple(group) for group in groups]
     parts += [(i,) for i in range(dimension) if i not in grouped]
     return tuple(
-        Periodic(dims) if set(dims) <= set(periodic) else SquaredExponential(dims)
+        Periodic(dims) if angles.issuperset(dims) else SquaredExponential(dims)
         for dims in sorted(parts)
     )
 

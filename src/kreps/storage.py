@@ -24,7 +24,7 @@ from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Window, is_sane
 from kreps.errors import KrepsError, StorageError
 from kreps.kernels import Kernel
-from kreps.policies import CostSensitiveGP, LearntPolicy
+from kreps.policies import MAX_SUPPORT, CostSensitiveGP, LearntPolicy
 from kreps.settings import AnySettings, LearnerSettings
 from kreps.threads import blas_threads
 from kreps.value import ValueFunction
@@ -125,6 +125,8 @@ def read_arrays(path: Path, kind: str) -> tuple[Tensors, Header]:
             missing = [n for n in promised if n not in names]
             if missing:
                 raise StorageError(f"array {missing[0]!r:.60} is missing")
+            if len(promised) != len(names):
+                raise StorageError("it holds arrays that its header does not name")
             tensors = {n: np.asarray(file.get_tensor(n)) for n in names}
     except StorageError as error:
         raise StorageError(f"cannot read {path} as a kreps {kind}: {error}") from error
@@ -368,8 +370,10 @@ def _policy_of(tensors: Tensors, task: TaskSpec, kind: str) -> LearntPolicy:
         ds=task.observation_size,
     )
     count = len(t["policy.states"])
-    if count == 0:
-        raise StorageError("the policy has no support point")
+    if not 0 < count <= MAX_SUPPORT:
+        raise StorageError(
+            f"the policy has {count} support points, but 1 to {MAX_SUPPORT} are possible"
+        )
     return _POLICIES[kind][2](tensors, task, _state_kernel(task, t["policy.lengthscales"]), count)
 
 
@@ -506,11 +510,11 @@ def load_checkpoint(
         task = _task_of(header)
         settings = settings_type(**header["settings"])
         counts = [header[name] for name in ("seed", "iteration", "rollouts", "steps")]
-        if not all(isinstance(count, int) and count >= 0 for count in counts):
+        if not all(type(count) is int and count >= 0 for count in counts):
             raise StorageError(f"seed and counts {counts} are not all whole numbers >= 0")
         seed, iteration, rollouts, steps = counts
         window = Window(settings.window)
-        if "window.lengths" in tensors:
+        if iteration > 0 or "window.lengths" in tensors:
             window = _window_of(tensors, task, settings.window)
         learnt, g = iteration > 0, task.factor_count
         if learnt and header["policy"] != POLICY_OF_METHOD[method]:
