@@ -99,10 +99,9 @@ TABLE_HEADINGS = ("method", "stochastic policy", "worst seed", "greedy policy", 
 
 def table_rows(summary: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
     """The summary in words: a row per method under `TABLE_HEADINGS`."""
-    largest = max(abs(entry["greedy"]["mean"]) for entry in summary.values())
-    places = 2 if largest >= 1.0 else 3
     rows = []
     for method, entry in summary.items():
+        places = 2 if abs(entry["greedy"]["mean"]) >= 1.0 else 3
         row = [method]
         for name in ("stochastic", "greedy"):
             mean, error = entry[name]["mean"], entry[name]["two_standard_errors"]
@@ -169,7 +168,8 @@ def write_figure(
         figure = plotting.comparison(rows, references, TITLES[name], source)
     else:
         some = next(iter(references.values()))
-        figure = plotting.learning_curves(rows, some, TITLES[name], source, list(METHODS))
+        known = list(METHODS) if rows[0]["method"] in METHODS else []
+        figure = plotting.learning_curves(rows, some, TITLES[name], source, known)
     picture = plotting.save(figure, folder / f"{name}.png")
     return [folder / f"{name}.{ending}" for ending in ("csv", "json", "md")] + [picture]
 
