@@ -42,7 +42,6 @@ HEADINGS = [
     "Choices",
 ]
 KERNEL_PAGE = (FOLDER / "kernel_reps.md").read_text()
-"""Pictures of results/ that need not be there yet."""
 
 METHOD_OF_PAGE = {
     "kernel_reps": "kernel REPS",
