@@ -38,6 +38,7 @@ from kreps.experiments.figures import (
 from kreps.experiments.runner import figure_cells, run_cells
 from kreps.experiments.specs import FIGURES, METHODS, TASKS
 from kreps.learner import LEARNERS
+from kreps.settings import RECIPES, settings_of
 
 TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 
@@ -175,6 +176,7 @@ def test_the_committed_search_is_of_the_candidates_of_today() -> None:
             assert found["chosen"] == candidates[int(np.argmax(means))]
             assert search.tuned_options(task, method) == found["chosen"]
     assert search.tuned_options("swing-up", "kreps (default)") == {}
+    assert settings_of(**search.tuned_options("images", "kernel REPS")) == RECIPES["images"]
 
 
 # ---- claims -----------------------------------------------------------------------------------

@@ -67,6 +67,7 @@ def options(
     epilog="Examples:\n\n"
     "  kreps train kreps/SwingUp-v0 --iterations 20 --seed 0 --out runs/swing-up\n\n"
     "  kreps train kreps/SwingUp-v0 --recipe paper --out runs/paper-like\n\n"
+    "  kreps train kreps/ImageSwingUp-v0 --recipe images --iterations 15 --out runs/images\n\n"
     "  kreps train Pendulum-v1 --set kl_bound=0.5 --set window=60 --out runs/pendulum\n\n"
     "  kreps train my_robot.envs:Arm-v0 --periodic 0 --periodic 1 --out runs/arm"
 )
@@ -78,7 +79,7 @@ def train(
     iterations: Annotated[int, typer.Option(min=1, help="Policy updates to make.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same policy.")] = 0,
     recipe: Annotated[
-        str, typer.Option(help="default, or paper: close to the printed method.")
+        str, typer.Option(help="default; paper: close to the printed method; images: for pictures.")
     ] = "default",
     set_: Annotated[
         list[str],

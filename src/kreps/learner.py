@@ -321,7 +321,8 @@ class KREPS(OnPolicyLearner[Settings]):
 
     Args:
         env, seed, periodic, threads: as of `Learner`.
-        recipe: ``"default"``, ``"paper"`` (close to the printed method) or a `kreps.Settings`.
+        recipe: ``"default"``, ``"paper"`` (close to the printed method), ``"images"`` (for
+            observations that are pictures) or a `kreps.Settings`.
         **settings: any field of `kreps.Settings`, such as ``kl_bound``.
 
     Raises:
