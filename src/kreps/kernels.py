@@ -23,11 +23,6 @@ from kreps.linalg import principal_coordinates
 class Factor(Protocol):
     """One factor of a product kernel, with one lengthscale."""
 
-    @property
-    def dims(self) -> tuple[int, ...]:
-        """The columns of the input that it sees."""
-        ...
-
     def coordinates(self, x: FloatArray) -> FloatArray:
         """Euclidean coordinates (n, m) of inputs (n, d) at lengthscale one."""
         ...
@@ -125,6 +120,10 @@ class Kernel:
 
     def with_lengthscales(self, lengthscales: FloatArray) -> Kernel:
         return replace(self, lengthscales=lengthscales)
+
+    def part(self, chosen: slice) -> Kernel:
+        """The product of some of the factors."""
+        return Kernel(self.factors[chosen], self.lengthscales[chosen])
 
     def embed(self, x: FloatArray) -> FloatArray:
         """``e(x)``, (n, m), for inputs (n, d)."""

@@ -11,7 +11,7 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 
-from kreps.arrays import FloatArray
+from kreps.arrays import FloatArray, grid_points
 from kreps.data import LARGEST, Rollout, TaskSpec, is_sane
 from kreps.envs.batch import BatchModel, SettableModel
 from kreps.envs.restart import RandomRestart, restart_length
@@ -165,8 +165,7 @@ def collect_grid(
         np.linspace(low, high, grid_actions)
         for low, high in zip(task.action_low, task.action_high, strict=True)
     ]
-    grid = np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
-    states, actions = np.split(grid, [task.observation_size], axis=1)
+    states, actions = np.split(grid_points(axes), [task.observation_size], axis=1)
     rngs = [generator(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
     try:
         simulated = cast(SettableModel, model).states_at(states)

@@ -17,6 +17,11 @@ CHUNK = 2048
 """States that are served at once: bounds the memory of a large batch."""
 
 
+def _chunks(states: FloatArray) -> list[FloatArray]:
+    """At least one, even of no states."""
+    return [states[i : i + CHUNK] for i in range(0, max(len(states), 1), CHUNK)]
+
+
 @dataclass(frozen=True)
 class SoftmaxPolicy:
     """Chooses among candidate actions with probability proportional to ``exp(Q / temperature)``.
@@ -47,11 +52,8 @@ class SoftmaxPolicy:
 
     def q_values(self, states: FloatArray) -> FloatArray:
         """Q (m, k) at states (m, ds)."""
-        q = np.empty((len(states), len(self.candidates)))
-        for i in range(0, len(states), CHUNK):
-            k = gaussian_gram(self._coordinates, self.kernel.embed(states[i : i + CHUNK]))
-            q[i : i + CHUNK] = k.T @ self.table + self.offset
-        return q
+        grams = (gaussian_gram(self._coordinates, self.kernel.embed(s)) for s in _chunks(states))
+        return np.concatenate([k.T @ self.table + self.offset for k in grams])
 
     def value(self, states: FloatArray) -> FloatArray:
         """V (m,) at states (m, ds): the soft maximum of Q."""
@@ -118,16 +120,11 @@ class LipschitzPolicy:
 
     def value(self, states: FloatArray) -> FloatArray:
         """V (m,) at states (m, ds)."""
-        value = np.empty(len(states))
-        for i in range(0, len(states), CHUNK):
-            value[i : i + CHUNK] = self._bounds_at(states[i : i + CHUNK]).max(axis=1)
-        return value
+        return np.concatenate([self._bounds_at(s).max(axis=1) for s in _chunks(states)])
 
     def greedy(self, states: FloatArray) -> FloatArray:
-        chosen = np.empty(len(states), dtype=np.intp)
-        for i in range(0, len(states), CHUNK):
-            chosen[i : i + CHUNK] = self._bounds_at(states[i : i + CHUNK]).argmax(axis=1)
-        return self.actions[chosen]
+        chosen = [self._bounds_at(s).argmax(axis=1) for s in _chunks(states)]
+        return self.actions[np.concatenate(chosen)]
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
         # One normal number both decides whether there is noise and, stretched back to a whole

@@ -119,13 +119,13 @@ def update(
     clock.lap("basis")
 
     # Eq. 4: expected features of each successor
-    successors = successor_features(data, features)
     origin = embedding_origin(data, features, settings)
+    successors = successor_features(data, features) - origin
     model, embedding_start = transition_model(
-        data, successors - origin, kernel, task, settings, state.embedding_start, rng
+        data, successors, kernel, task, settings, state.embedding_start, rng
     )
     clock.lap("embedding fit")
-    expected = origin + model.expected_features(successors - origin)
+    expected = origin + model.expected_features(successors)
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual

@@ -28,7 +28,12 @@ def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) ->
 
 
 def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
-    """Observed ``phi(s'_i)``, (n, r); after a real end the start states are the successor."""
+    """Observed ``phi(s'_i)``, (n, r) or (n,); after a real end the start states are the successor.
+
+    Args:
+        data: n transitions.
+        features: (m, r) or (m,) of all points.
+    """
     successors = features[data.successor]
     successors[data.terminated] = features[data.start].mean(axis=0)
     return successors

@@ -14,13 +14,12 @@ import numpy as np
 
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import fit_embedding, state_kernel, successor_features
-from kreps.arrays import FloatArray
+from kreps.arrays import FloatArray, grid_points
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.dual import standardise
 from kreps.embedding import KernelEmbedding
 from kreps.errors import ConfigurationError
-from kreps.kernels import Kernel
-from kreps.settings import GridValueIterationSettings, ValueIterationSettings
+from kreps.settings import GridValueIterationSettings, Settings, ValueIterationSettings
 from kreps.value import RKHSBasis
 from kreps.value_policies import SoftmaxPolicy, soft_maximum
 
@@ -30,9 +29,8 @@ MAX_SWEEPS = 300
 TOLERANCE = 1e-3
 """Of V between sweeps, up to a constant, in standard deviations of the reward."""
 
-MAX_RANK = 400
-BASIS_TOLERANCE = 1e-6
-"""Of the features that the embedding is fitted to predict, as in REPS."""
+BASIS = Settings()
+"""Its basis is that of the features that the embedding is fitted to predict: as in REPS."""
 
 
 @dataclass(frozen=True)
@@ -85,27 +83,28 @@ def update(
     window, data = state.extended(rollouts, task)
     clock = Stopwatch()
     kernel = state_kernel(data, task, rng)
-    _, features = RKHSBasis.fit(kernel, data.points, tolerance=BASIS_TOLERANCE, max_rank=MAX_RANK)
+    _, features = RKHSBasis.fit(
+        kernel, data.points, tolerance=BASIS.basis_tolerance, max_rank=BASIS.max_rank
+    )
     clock.lap("basis")
     model, start = fit_embedding(
         data, successor_features(data, features), kernel, task, state.embedding_start, rng
     )
     clock.lap("embedding")
     rewards, unit = standardise(data.rewards)
-    temperature = settings.temperature
     candidates = candidate_actions(task, settings.actions)
     table, offset, sweeps, change = iterate_values(
-        model, data, rewards, candidates, temperature, 1.0 - settings.restart_probability
+        model, data, rewards, candidates, settings.temperature, 1.0 - settings.restart_probability
     )
     clock.lap("sweeps")
     policy = SoftmaxPolicy(
         task,
-        _on_states(model.kernel, task),
+        model.kernel.part(slice(-task.action_size)),
         data.states,
         unit * table,
         unit * offset + float(data.rewards.max()) / settings.restart_probability,
         candidates,
-        unit * temperature,
+        unit * settings.temperature,
     )
     new_state = state.after(rollouts, window, policy=policy, embedding_start=start)
     info = ValueIterationInfo(len(data), sweeps, change, np.exp(start), clock.seconds)
@@ -125,8 +124,7 @@ def candidate_actions(task: TaskSpec, count: int) -> FloatArray:
             f"make 2^{task.action_size} candidates; raise actions, or use kreps.KREPS, which has "
             "no grid"
         )
-    axes = [np.linspace(-1.0, 1.0, levels)] * task.action_size
-    return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)
+    return grid_points([np.linspace(-1.0, 1.0, levels)] * task.action_size)
 
 
 def iterate_values(
@@ -154,18 +152,17 @@ def iterate_values(
         Table (n, k) and offset with ``Q(s, a_k) = offset + sum_i k_s(s_i, s) table_ik``, sweeps
         made, and the change of V (up to a constant) in the last one.
     """
-    ds = data.points.shape[1]
-    by_state, by_action = _split(model.kernel, ds)
-    states = by_state.gram(data.states, data.points).T  # (points, n)
-    actions = by_action.gram(model.inputs, _beside(candidates, ds))  # (n, k)
+    ds, da = data.points.shape[1], candidates.shape[1]
+    # the kernel's last factors are those of the actions, one for each coordinate
+    states = model.kernel.part(slice(-da)).gram(data.states, data.points).T  # (points, n)
+    in_their_columns = np.pad(candidates, ((0, 0), (ds, 0)))
+    actions = model.kernel.part(slice(-da, None)).gram(model.inputs, in_their_columns)  # (n, k)
     least, most = rewards.min() / (1.0 - gamma), rewards.max() / (1.0 - gamma)
     values = np.zeros(len(data.points))
     sweeps = 0
     while True:
         sweeps += 1
-        successors = values[data.successor]
-        successors[data.terminated] = values[data.start].mean()
-        targets = rewards + gamma * successors
+        targets = rewards + gamma * successor_features(data, values)
         offset = float(targets.mean())
         table = model.factor.solve(targets - offset)[:, None] * actions
         # what rewards in this range can add up to bounds an expectation that is none
@@ -177,23 +174,3 @@ def iterate_values(
             # differences of V have settled; its level goes on by a geometric series
             offset += float(difference.mean()) * gamma / (1.0 - gamma)
             return table, offset, sweeps, change
-
-
-def _split(kernel: Kernel, observation_size: int) -> tuple[Kernel, Kernel]:
-    """The factors of a kernel that see states, and those that see actions."""
-    of_state = [max(factor.dims) < observation_size for factor in kernel.factors]
-
-    def part(wanted: bool) -> Kernel:
-        chosen = [i for i, is_state in enumerate(of_state) if is_state is wanted]
-        return Kernel(tuple(kernel.factors[i] for i in chosen), kernel.lengthscales[chosen])
-
-    return part(True), part(False)
-
-
-def _on_states(kernel: Kernel, task: TaskSpec) -> Kernel:
-    return _split(kernel, task.observation_size)[0]
-
-
-def _beside(actions: FloatArray, observation_size: int) -> FloatArray:
-    """Actions in their columns of the kernel's input; the states' columns do not matter."""
-    return np.concatenate([np.zeros((len(actions), observation_size)), actions], axis=1)

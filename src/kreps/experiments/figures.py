@@ -30,15 +30,11 @@ def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [row for result in results for row in result["rows"]]
 
 
-def curve_name(row: Mapping[str, Any], several_tasks: bool) -> str:
-    """What a figure calls the curve that a row belongs to."""
-    return f"{row['method']}, {row['task']}" if several_tasks else str(row["method"])
-
-
 def named_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The rows with their curve's name as ``method``: it names the task where there are several."""
-    several = len({row["task"] for row in rows}) > 1
-    return [{**row, "method": curve_name(row, several)} for row in rows]
+    if len({row["task"] for row in rows}) == 1:
+        return [{**row} for row in rows]
+    return [{**row, "method": f"{row['method']}, {row['task']}"} for row in rows]
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:

@@ -76,8 +76,7 @@ def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[d
                 write_cell(cell, folder, result)
                 bar.update(task, advance=1, last=cell.name)
                 if not bar.console.is_terminal:  # a log: a line each
-                    done_now = sum(1 for each in results.values() if each)
-                    print(f"{done_now}/{len(cells)} cells: {cell.name}", flush=True)
+                    print(f"{bar.tasks[0].completed:g}/{len(cells)} cells: {cell.name}", flush=True)
 
         for work in same.keys() & done.keys():
             keep(work, done[work])
