@@ -23,6 +23,7 @@ import safetensors
 import safetensors.numpy
 
 import kreps
+from kreps import storage
 from kreps.algorithms.state import LearnerState
 from kreps.data import TaskSpec
 from kreps.errors import StorageError
@@ -1007,3 +1008,15 @@ def test_resuming_in_another_environment_is_refused(checkpoint: Good, tmp_path: 
     path.write_bytes(checkpoint.content)
     with pytest.raises(kreps.ConfigurationError, match="learnt in"):
         LEARNERS[checkpoint.method].resume(path, gym.make("Pendulum-v1"))
+
+
+def test_what_could_not_be_read_back_is_not_written(
+    learnt: Learner[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "policy"
+    learnt.policy.save(path)
+    before = path.read_bytes()
+    monkeypatch.setattr(storage, "MAX_FILE_BYTES", len(before) - 1)
+    with pytest.raises(StorageError, match="smaller window"):
+        learnt.policy.save(path)
+    assert path.read_bytes() == before

@@ -97,7 +97,13 @@ def write_arrays(path: Path, kind: str, tensors: Tensors, header: Header) -> Non
             f"{MAX_HEADER_BYTES // 2}; observe with fewer coordinates, such as smaller images"
         )
     arrays = {name: np.ascontiguousarray(tensors[name]) for name in sorted(tensors)}
-    write_atomically(path, safetensors.numpy.save(arrays, metadata={"kreps": text}))
+    content = safetensors.numpy.save(arrays, metadata={"kreps": text})
+    if len(content) > MAX_FILE_BYTES:
+        raise StorageError(
+            f"{path} would have {len(content)} bytes, the limit is {MAX_FILE_BYTES}; keep fewer "
+            "roll-outs by a smaller window, or observe with fewer coordinates"
+        )
+    write_atomically(path, content)
 
 
 def read_arrays(path: Path, kind: str) -> tuple[Tensors, Header]:
@@ -233,16 +239,17 @@ def _process_parts(policy: CostSensitiveGP) -> Tensors:
     }
 
 
-def _process_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, m: int) -> CostSensitiveGP:
+def _process_of(
+    tensors: Tensors, task: TaskSpec, kernel: Kernel, states: FloatArray
+) -> CostSensitiveGP:
     t = _take(
         tensors,
         {
-            "policy.states": ("m", "ds"),
             "policy.targets": ("m", "da"),
             "policy.weights": ("m",),
             "policy.signal_and_noise": (2,),
         },
-        m=m,
+        m=len(states),
         da=task.action_size,
     )
     weights, variances = t["policy.weights"], t["policy.signal_and_noise"]
@@ -252,7 +259,7 @@ def _process_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, m: int) -> Cos
         return CostSensitiveGP(
             task=task,
             kernel=kernel,
-            states=t["policy.states"],
+            states=states,
             targets=t["policy.targets"],
             weights=weights,
             signal=float(variances[0]),
@@ -268,16 +275,17 @@ def _softmax_parts(policy: SoftmaxPolicy) -> Tensors:
     }
 
 
-def _softmax_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, m: int) -> SoftmaxPolicy:
+def _softmax_of(
+    tensors: Tensors, task: TaskSpec, kernel: Kernel, states: FloatArray
+) -> SoftmaxPolicy:
     t = _take(
         tensors,
         {
-            "policy.states": ("m", "ds"),
             "policy.table": ("m", "k"),
             "policy.candidates": ("k", "da"),
             "policy.offset_and_temperature": (2,),
         },
-        m=m,
+        m=len(states),
         da=task.action_size,
     )
     offset, temperature = t["policy.offset_and_temperature"]
@@ -286,7 +294,7 @@ def _softmax_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, m: int) -> Sof
     return SoftmaxPolicy(
         task,
         kernel,
-        t["policy.states"],
+        states,
         t["policy.table"],
         float(offset),
         t["policy.candidates"],
@@ -304,16 +312,17 @@ def _lipschitz_parts(policy: LipschitzPolicy) -> Tensors:
     }
 
 
-def _lipschitz_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, m: int) -> LipschitzPolicy:
+def _lipschitz_of(
+    tensors: Tensors, task: TaskSpec, kernel: Kernel, states: FloatArray
+) -> LipschitzPolicy:
     t = _take(
         tensors,
         {
-            "policy.states": ("m", "ds"),
             "policy.actions": ("m", "da"),
             "policy.bounds": ("m",),
             "policy.slope_and_noise": (3,),
         },
-        m=m,
+        m=len(states),
         da=task.action_size,
     )
     slope, fraction, scale = t["policy.slope_and_noise"].tolist()
@@ -322,7 +331,7 @@ def _lipschitz_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, m: int) -> L
     return LipschitzPolicy(
         task,
         kernel,
-        t["policy.states"],
+        states,
         t["policy.actions"],
         t["policy.bounds"],
         slope,
@@ -337,7 +346,6 @@ _POLICIES: dict[str, tuple[type[Any], Callable[[Any], Tensors], Callable[..., Le
     "lipschitz": (LipschitzPolicy, _lipschitz_parts, _lipschitz_of),
 }
 """By name in files: the class, what to write of it beside kernel and states, how to read it."""
-
 
 POLICY_OF_METHOD = {
     "reps": "cost-sensitive-gp",
@@ -369,12 +377,13 @@ def _policy_of(tensors: Tensors, task: TaskSpec, kind: str) -> LearntPolicy:
         factors=task.factor_count,
         ds=task.observation_size,
     )
-    count = len(t["policy.states"])
-    if not 0 < count <= MAX_SUPPORT:
+    states = t["policy.states"]
+    if not 0 < len(states) <= MAX_SUPPORT:
         raise StorageError(
-            f"the policy has {count} support points, but 1 to {MAX_SUPPORT} are possible"
+            f"the policy has {len(states)} support points, but 1 to {MAX_SUPPORT} are possible"
         )
-    return _POLICIES[kind][2](tensors, task, _state_kernel(task, t["policy.lengthscales"]), count)
+    read = _POLICIES[kind][2]
+    return read(tensors, task, _state_kernel(task, t["policy.lengthscales"]), states)
 
 
 def _value_parts(value: ValueFunction) -> Tensors:
