@@ -1,10 +1,16 @@
-"""The array types the library speaks, and the one conversion at its border."""
+"""The array types the library speaks, and the conversions at its borders.
+
+Whatever grows with the number of samples is computed in the array library that the samples come
+in: NumPy, or any other that follows the array API standard (CuPy, PyTorch).  What is left then, of
+the size of a basis, is NumPy.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from typing import Any
 
+import array_api_compat
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,10 +18,41 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
+Array = Any
+"""Floats (float64) of any library that follows the array API standard."""
+
 
 def as_float(values: Any) -> FloatArray:
     """``values`` as a float64 array; no copy if it is one already."""
     return np.asarray(values, dtype=np.float64)
+
+
+def namespace(array: Array) -> Any:
+    """The functions of the library that ``array`` is of."""
+    return np if isinstance(array, np.ndarray) else array_api_compat.array_namespace(array)
+
+
+def like(values: FloatArray, other: Array) -> Array:
+    """``values`` in the library and on the device of ``other``."""
+    if isinstance(other, np.ndarray):
+        return values
+    device = array_api_compat.device(other)
+    return array_api_compat.array_namespace(other).asarray(values, device=device)
+
+
+def as_numpy(array: Array) -> FloatArray:
+    """``array`` in NumPy, on the CPU."""
+    if isinstance(array, np.ndarray):
+        return array
+    return np.asarray(array_api_compat.to_device(array, "cpu"))
+
+
+def columns(array: Array, chosen: Sequence[int]) -> Array:
+    """``array[:, chosen]``."""
+    if isinstance(array, np.ndarray):
+        return array[:, chosen]
+    xp = namespace(array)
+    return xp.take(array, xp.asarray(chosen, device=array_api_compat.device(array)), axis=1)
 
 
 def grid_points(axes: Sequence[FloatArray]) -> FloatArray:

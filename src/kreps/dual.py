@@ -1,24 +1,59 @@
 """Eqs. 1, 2 and 5: the convex dual of the bounded policy update, and its certified solution.
 
 Every variant of REPS is ``delta = R + B theta``; they differ only in how B came about.  So one
-solver serves them all.  The ridge ``rho / 2 |theta|^2`` is not in the paper: without it
-stationarity is enforced in every direction of a rich basis, and the dual need not be bounded.
+solver serves them all.  It sees B only through `Moments`, which add up over chunks of the samples:
+the same Newton method runs on a matrix in memory and on a million rows that never are.
+
+The ridge ``rho / 2 |theta|^2`` is not in the paper: without it stationarity is enforced in every
+direction of a rich basis, and the dual need not be bounded.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Protocol
 
 import numpy as np
 
-from kreps.arrays import FloatArray
+from kreps.arrays import Array, FloatArray, as_numpy, namespace
 from kreps.linalg import cholesky
+
+
+class Problem(Protocol):
+    """The data of one update, as the solver sees it."""
+
+    @property
+    def rewards(self) -> FloatArray:
+        """(n,) rewards R in units of their standard deviation, largest one zero."""
+        ...
+
+    @property
+    def rank(self) -> int:
+        """Number of features r."""
+        ...
+
+    @property
+    def kl_bound(self) -> float: ...
+
+    @property
+    def ridge(self) -> float: ...
+
+    @property
+    def eta_floor(self) -> float: ...
+
+    def bellman_errors(self, theta: FloatArray) -> FloatArray:
+        """``delta``, (n,)."""
+        ...
+
+    def moments(self, eta: float, theta: FloatArray, *, scatter: bool) -> Moments:
+        """Of all rows of B and all Bellman errors."""
+        ...
 
 
 @dataclass(frozen=True)
 class DualProblem:
-    """The data of one update.
+    """A `Problem` in memory.
 
     Attributes:
         rewards: (n,) rewards R in units of their standard deviation, largest one zero.
@@ -35,6 +70,105 @@ class DualProblem:
     ridge: float
     eta_floor: float
 
+    @property
+    def rank(self) -> int:
+        return self.differences.shape[1]
+
+    def bellman_errors(self, theta: FloatArray) -> FloatArray:
+        return self.rewards + self.differences @ theta
+
+    def moments(self, eta: float, theta: FloatArray, *, scatter: bool) -> Moments:
+        delta = self.bellman_errors(theta)
+        return Moments.of(delta, self.differences, eta, scatter=scatter)
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Rows b of B and Bellman errors under weights p proportional to ``exp(delta / eta)``.
+
+    They are all that value, gradient and Hessian of the dual need, and they add up over chunks.
+
+    Attributes:
+        samples: n.
+        eta: temperature of the weights.
+        top: ``max delta``.
+        log_mass: ``log sum_i exp((delta_i - top) / eta)``.
+        below: ``E_p[delta] - top``.
+        row: (r,) ``E_p[b] = B'p``.
+        scatter: (r + 1, r + 1) covariance under p of ``(b, -delta)``, or None if not asked for.
+    """
+
+    samples: int
+    eta: float
+    top: float
+    log_mass: float
+    below: float
+    row: FloatArray
+    scatter: FloatArray | None
+
+    @classmethod
+    def of(cls, delta: Array, rows: Array, eta: float, *, scatter: bool) -> Moments:
+        """Of some samples.
+
+        Args:
+            delta: (n,) their Bellman errors.
+            rows: (n, r) of B, of any array library, as ``delta``.
+            eta: temperature.
+            scatter: whether the covariance is needed.
+        """
+        xp = namespace(rows)
+        n, r = rows.shape
+        top = float(xp.max(delta))
+        lag = delta - top
+        p = xp.exp(lag / eta)
+        mass = float(xp.sum(p))
+        p = p / mass
+        below, row = float(p @ lag), p @ rows
+        covariance = None
+        if scatter:
+            root = xp.sqrt(p)
+            centred = rows - row
+            centred *= root[:, None]
+            fall = root * (below - lag)
+            covariance = np.empty((r + 1, r + 1))
+            covariance[:r, :r] = as_numpy(centred.T @ centred)
+            covariance[:r, r] = covariance[r, :r] = as_numpy(fall @ centred)
+            covariance[r, r] = float(fall @ fall)
+        return cls(n, eta, top, float(np.log(mass)), below, as_numpy(row), covariance)
+
+    def __add__(self, other: Moments) -> Moments:
+        """Those of the samples of both."""
+        top = max(self.top, other.top)
+        logs = np.array([m.log_mass + (m.top - top) / m.eta for m in (self, other)])
+        log_mass = float(np.logaddexp(*logs))
+        mine, theirs = np.exp(logs - log_mass).tolist()
+        apart = np.append(
+            self.row - other.row, other.top + other.below - self.top - self.below
+        )  # of (b, -delta)
+        covariance = None
+        if self.scatter is not None and other.scatter is not None:
+            covariance = mine * self.scatter + theirs * other.scatter
+            covariance += mine * theirs * np.outer(apart, apart)
+        return Moments(
+            samples=self.samples + other.samples,
+            eta=self.eta,
+            top=top,
+            log_mass=log_mass,
+            below=mine * (self.below + self.top - top) + theirs * (other.below + other.top - top),
+            row=mine * self.row + theirs * other.row,
+            scatter=covariance,
+        )
+
+    @property
+    def kl(self) -> float:
+        """``KL(p || uniform)`` in nats."""
+        return self.below / self.eta - self.log_mass + float(np.log(self.samples))
+
+    @property
+    def soft_maximum(self) -> float:
+        """``eta log mean exp(delta / eta)``."""
+        return self.top + self.eta * (self.log_mass - float(np.log(self.samples)))
+
 
 def standardise(rewards: FloatArray) -> tuple[FloatArray, float]:
     """``(R - max R) / std R`` and ``std R``; zeros and 1 where all rewards agree to rounding."""
@@ -45,9 +179,9 @@ def standardise(rewards: FloatArray) -> tuple[FloatArray, float]:
     return (rewards - top) / spread, spread
 
 
-def bellman_errors(problem: DualProblem, theta: FloatArray) -> FloatArray:
+def bellman_errors(problem: Problem, theta: FloatArray) -> FloatArray:
     """Eq. 5: ``delta = R + B theta``, (n,)."""
-    return problem.rewards + problem.differences @ theta
+    return problem.bellman_errors(theta)
 
 
 def sample_weights(delta: FloatArray, eta: float) -> FloatArray:
@@ -67,42 +201,46 @@ def effective_sample_size(p: FloatArray) -> float:
     return 1.0 / float(p @ p)
 
 
-def dual_value(problem: DualProblem, eta: float, theta: FloatArray) -> float:
+def dual_value(problem: Problem, eta: float, theta: FloatArray) -> float:
     """Eq. 2: ``g = eta epsilon + eta log mean exp(delta / eta) + rho / 2 |theta|^2``."""
-    delta = bellman_errors(problem, theta)
-    top = float(delta.max())
-    log_mean = top / eta + float(np.log(np.mean(np.exp((delta - top) / eta))))
-    return eta * (problem.kl_bound + log_mean) + 0.5 * problem.ridge * float(theta @ theta)
+    return _value(problem, theta, problem.moments(eta, theta, scatter=False))
 
 
-def dual_gradient(problem: DualProblem, eta: float, theta: FloatArray) -> tuple[float, FloatArray]:
+def dual_gradient(problem: Problem, eta: float, theta: FloatArray) -> tuple[float, FloatArray]:
     """``(g_eta, g_theta) = (epsilon - KL(p || uniform), B'p + rho theta)``."""
-    p = sample_weights(bellman_errors(problem, theta), eta)
-    g_theta = problem.differences.T @ p + problem.ridge * theta
-    return problem.kl_bound - kl_from_uniform(p), g_theta
+    return _gradient(problem, theta, problem.moments(eta, theta, scatter=False))
 
 
-def dual_hessian(problem: DualProblem, eta: float, theta: FloatArray) -> FloatArray:
+def dual_hessian(problem: Problem, eta: float, theta: FloatArray) -> FloatArray:
     """Hessian (r + 1, r + 1) in ``(theta, eta)``, the eta row and column multiplied by eta.
 
-    So scaled it is one symmetric product: with ``J = sqrt(p) [B - E_p B, -(delta - E_p delta)]``
-    it is ``J'J / eta`` plus rho on the diagonal of theta.
+    So scaled it is ``Cov_p(b, -delta) / eta`` plus rho on the diagonal of theta.
     """
-    delta = bellman_errors(problem, theta)
-    p = sample_weights(delta, eta)
-    root = np.sqrt(p)[:, None]
-    r = problem.differences.shape[1]
-    j = np.empty((len(p), r + 1))
-    np.multiply(problem.differences - p @ problem.differences, root, out=j[:, :r])
-    j[:, r] = -(delta - p @ delta) * root[:, 0]
-    hessian = j.T @ j / eta
+    return _hessian(problem, problem.moments(eta, theta, scatter=True))
+
+
+def _value(problem: Problem, theta: FloatArray, m: Moments) -> float:
+    return m.eta * problem.kl_bound + m.soft_maximum + 0.5 * problem.ridge * float(theta @ theta)
+
+
+def _gradient(problem: Problem, theta: FloatArray, m: Moments) -> tuple[float, FloatArray]:
+    return problem.kl_bound - m.kl, m.row + problem.ridge * theta
+
+
+def _hessian(problem: Problem, m: Moments) -> FloatArray:
+    assert m.scatter is not None
+    hessian = m.scatter / m.eta
+    r = len(m.row)
     hessian.flat[: r * (r + 2) : r + 2] += problem.ridge
     return hessian
 
 
 def primal_value(problem: DualProblem, p: FloatArray) -> float:
     """``p'R - |B'p|^2 / (2 rho)``: expected reward less the price of not being stationary."""
-    imbalance = problem.differences.T @ p
+    return _primal(problem, p, problem.differences.T @ p)
+
+
+def _primal(problem: Problem, p: FloatArray, imbalance: FloatArray) -> float:
     return float(p @ problem.rewards - imbalance @ imbalance / (2.0 * problem.ridge))
 
 
@@ -165,6 +303,7 @@ class _Progress:
 
     eta: float
     theta: FloatArray
+    moments: Moments
     decrement: float
     iterations: int
     jitter: float
@@ -177,17 +316,23 @@ KL_TOLERANCE = 1e-4  # relative to the bound
 """All three are asked for: the decrement alone lies as eta -> 0, where the curvature explodes."""
 
 
-def solve_dual(problem: DualProblem, max_iterations: int = 40) -> DualSolution:
+def solve_dual(
+    problem: Problem,
+    max_iterations: int = 40,
+    start: tuple[float, FloatArray] | None = None,
+) -> DualSolution:
     """Minimise the dual over eta >= floor and theta: damped Newton, with bisection to fall back on.
 
     Args:
         problem: the update's data.
         max_iterations: of the joint Newton method before the fallback takes over.
+        start: eta and theta to start from, such as the solution for a part of the samples.
     """
-    # Where all rewards agree nothing can be gained, and the temperature belongs to its floor.
-    start = max(1.0, problem.eta_floor) if problem.rewards.any() else problem.eta_floor
-    zero = np.zeros(problem.differences.shape[1])
-    end = _newton(problem, start, zero, max_iterations, eta_free=True)
+    if start is None:
+        # Where all rewards agree nothing can be gained: the temperature belongs to its floor.
+        eta = max(1.0, problem.eta_floor) if problem.rewards.any() else problem.eta_floor
+        start = eta, np.zeros(problem.rank)
+    end = _newton(problem, *start, max_iterations, eta_free=True)
     outcome = Outcome.BOUND_ACTIVE
     if not end.converged:
         end = _bisection(problem, end)
@@ -197,18 +342,18 @@ def solve_dual(problem: DualProblem, max_iterations: int = 40) -> DualSolution:
     return _certify(problem, end, outcome)
 
 
-def _certify(problem: DualProblem, end: _Progress, outcome: Outcome) -> DualSolution:
-    weights = sample_weights(bellman_errors(problem, end.theta), end.eta)
+def _certify(problem: Problem, end: _Progress, outcome: Outcome) -> DualSolution:
+    weights = sample_weights(problem.bellman_errors(end.theta), end.eta)
     kl = kl_from_uniform(weights)
-    primal = primal_value(problem, weights)
+    primal = _primal(problem, weights, end.moments.row)
     if outcome is Outcome.AT_FLOOR:  # the temperature is a given price of KL, not a multiplier
         primal += end.eta * (problem.kl_bound - kl)
-    _, g_theta = dual_gradient(problem, end.eta, end.theta)
+    _, g_theta = _gradient(problem, end.theta, end.moments)
     return DualSolution(
         eta=end.eta,
         theta=end.theta,
         weights=weights,
-        dual=dual_value(problem, end.eta, end.theta),
+        dual=_value(problem, end.theta, end.moments),
         primal=primal,
         kl=kl,
         decrement=end.decrement,
@@ -220,15 +365,16 @@ def _certify(problem: DualProblem, end: _Progress, outcome: Outcome) -> DualSolu
 
 
 def _newton(
-    problem: DualProblem, eta: float, theta: FloatArray, max_iterations: int, *, eta_free: bool
+    problem: Problem, eta: float, theta: FloatArray, max_iterations: int, *, eta_free: bool
 ) -> _Progress:
     """Damped Newton from ``(eta, theta)``, projected on ``eta >= floor``; or in theta alone."""
     floor = problem.eta_floor
-    value = dual_value(problem, eta, theta)
+    here = problem.moments(eta, theta, scatter=True)
+    value = _value(problem, theta, here)
     decrement, jitter = np.inf, 0.0
     for iteration in range(max_iterations):
-        g_eta, g_theta = dual_gradient(problem, eta, theta)
-        hessian = dual_hessian(problem, eta, theta)
+        g_eta, g_theta = _gradient(problem, theta, here)
+        hessian = _hessian(problem, here)
         at_floor = eta <= floor
         moves_eta = eta_free and not (at_floor and g_eta >= 0)
         stretch = 0.0  # relative change of eta
@@ -246,32 +392,37 @@ def _newton(
         kl_met = not moves_eta or abs(g_eta) <= KL_TOLERANCE * problem.kl_bound
         gap = float(g_theta @ g_theta) / (2.0 * problem.ridge)
         if decrement <= DECREMENT_TOLERANCE and gap <= GAP_TOLERANCE and kl_met:
-            return _Progress(eta, theta, decrement, iteration, jitter, True)
+            return _Progress(eta, theta, here, decrement, iteration, jitter, True)
         least = max(0.5, floor / eta) - 1.0  # eta at most halves and never passes its floor
         length = 1.0 if stretch >= least else least / stretch
         rounding = 1e-14 * max(1.0, abs(value))
+        first = True  # mostly good enough, so its curvature is taken in the same pass
         while length > 1e-12:
             new_eta = max(eta * (1.0 + length * stretch), floor)
+            if new_eta <= floor * (1.0 + 1e-9):
+                new_eta = floor  # exactly, not a rounding error above it
             new_theta = theta + length * step
-            new_value = dual_value(problem, new_eta, new_theta)
+            there = problem.moments(new_eta, new_theta, scatter=first)
+            new_value = _value(problem, new_theta, there)
             if new_value <= value + 1e-4 * length * slope + rounding:
                 break
             length *= 0.5
+            first = False
         else:
-            return _Progress(eta, theta, decrement, iteration, jitter, False)
-        # land on the floor exactly, not a rounding error above it
-        eta = floor if new_eta <= floor * (1.0 + 1e-9) else new_eta
-        theta, value = new_theta, new_value
-    return _Progress(eta, theta, decrement, max_iterations, jitter, False)
+            return _Progress(eta, theta, here, decrement, iteration, jitter, False)
+        eta, theta, value, here = new_eta, new_theta, new_value, there
+        if here.scatter is None:
+            here = problem.moments(eta, theta, scatter=True)
+    return _Progress(eta, theta, here, decrement, max_iterations, jitter, False)
 
 
-def _bisection(problem: DualProblem, stalled: _Progress) -> _Progress:
+def _bisection(problem: Problem, stalled: _Progress) -> _Progress:
     """Newton in theta along a path of temperatures: slow and sure, as KL falls with eta.
 
     From eta = 1 the temperature is halved (or doubled) until the KL bound is passed, then
     bisected in the logarithm.  Each solve starts from the one before, so none has far to go.
     """
-    eta, theta = max(1.0, problem.eta_floor), np.zeros(problem.differences.shape[1])
+    eta, theta = max(1.0, problem.eta_floor), np.zeros(problem.rank)
     low, high = 0.0, np.inf  # KL is too large at low, too small at high
     iterations, jitter, end = stalled.iterations, stalled.jitter, stalled
     for _ in range(100):
@@ -279,10 +430,12 @@ def _bisection(problem: DualProblem, stalled: _Progress) -> _Progress:
         theta = end.theta
         iterations += end.iterations
         jitter = max(jitter, end.jitter)
-        g_eta, _ = dual_gradient(problem, eta, theta)
+        g_eta = problem.kl_bound - end.moments.kl
         at_floor = eta <= problem.eta_floor and g_eta >= 0
         if at_floor or abs(g_eta) <= KL_TOLERANCE * problem.kl_bound:
-            return _Progress(eta, theta, end.decrement, iterations, jitter, end.converged)
+            return _Progress(
+                eta, theta, end.moments, end.decrement, iterations, jitter, end.converged
+            )
         if g_eta < 0:
             low = eta
         else:
@@ -293,4 +446,4 @@ def _bisection(problem: DualProblem, stalled: _Progress) -> _Progress:
             eta = max(0.5 * eta, problem.eta_floor)
         else:
             eta = float(np.sqrt(low * high))
-    return _Progress(eta, theta, end.decrement, iterations, jitter, False)
+    return _Progress(eta, theta, end.moments, end.decrement, iterations, jitter, False)

@@ -9,13 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Protocol
 
-from kreps.arrays import FloatArray
+from kreps.arrays import Array
 from kreps.kernels import Kernel
-from kreps.linalg import Cholesky, cholesky
+from kreps.linalg import Cholesky, cholesky, with_diagonal
 
 
 class TransitionModel(Protocol):
-    def expected_features(self, successor_features: FloatArray) -> FloatArray:
+    def expected_features(self, successor_features: Array) -> Array:
         """``E[phi(s') | s_i, a_i]``, (n, r), from the observed ``phi(s'_i)``, (n, r)."""
         ...
 
@@ -32,21 +32,20 @@ class KernelEmbedding:
     """
 
     kernel: Kernel
-    inputs: FloatArray
+    inputs: Array
     regulariser: float
     factor: Cholesky
 
     @classmethod
-    def fit(cls, kernel: Kernel, inputs: FloatArray, regulariser: float) -> KernelEmbedding:
+    def fit(cls, kernel: Kernel, inputs: Array, regulariser: float) -> KernelEmbedding:
         gram = kernel.gram(inputs)
-        gram.flat[:: len(gram) + 1] += regulariser
-        return cls(kernel, inputs, regulariser, cholesky(gram))
+        return cls(kernel, inputs, regulariser, cholesky(with_diagonal(gram, regulariser)))
 
-    def strengths(self, inputs: FloatArray) -> FloatArray:
+    def strengths(self, inputs: Array) -> Array:
         """``beta(s, a) = (K_sa + lambda I)^-1 k_sa(s, a)``, (n, m), for inputs (m, ds + da)."""
         return self.factor.solve(self.kernel.gram(self.inputs, inputs))
 
-    def expected_features(self, successor_features: FloatArray) -> FloatArray:
+    def expected_features(self, successor_features: Array) -> Array:
         """``K_sa (K_sa + lambda I)^-1 F'``, (n, r), without forming beta for all pairs.
 
         By ``K = (K + lambda I) - lambda I`` this is ``F' - lambda (K_sa + lambda I)^-1 F'``.
@@ -59,5 +58,5 @@ class KernelEmbedding:
 class SampleModel:
     """The single observed successor stands for the expectation: ``ksa = identity`` in Eq. 4."""
 
-    def expected_features(self, successor_features: FloatArray) -> FloatArray:
+    def expected_features(self, successor_features: Array) -> Array:
         return successor_features

@@ -16,14 +16,14 @@ from typing import Protocol
 
 import numpy as np
 
-from kreps.arrays import FloatArray
+from kreps.arrays import Array, FloatArray, columns, like, namespace
 from kreps.linalg import principal_coordinates
 
 
 class Factor(Protocol):
     """One factor of a product kernel, with one lengthscale."""
 
-    def coordinates(self, x: FloatArray) -> FloatArray:
+    def coordinates(self, x: Array) -> Array:
         """Euclidean coordinates (n, m) of inputs (n, d) at lengthscale one."""
         ...
 
@@ -34,8 +34,8 @@ class SquaredExponential:
 
     dims: tuple[int, ...]
 
-    def coordinates(self, x: FloatArray) -> FloatArray:
-        return x[:, self.dims]
+    def coordinates(self, x: Array) -> Array:
+        return columns(x, self.dims)
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class Periodic:
 
     dims: tuple[int, ...]
 
-    def coordinates(self, x: FloatArray) -> FloatArray:
-        angles = x[:, self.dims]
-        return np.concatenate([np.cos(angles), np.sin(angles)], axis=1)
+    def coordinates(self, x: Array) -> Array:
+        xp, angles = namespace(x), columns(x, self.dims)
+        return xp.concat([xp.cos(angles), xp.sin(angles)], axis=1)
 
 
 IMAGE_BLUR = 0.3
@@ -64,10 +64,11 @@ class SmoothedImage:
     dims: tuple[int, ...]
     shape: tuple[int, int]
 
-    def coordinates(self, x: FloatArray) -> FloatArray:
-        rows, columns = (_smoothing(size) for size in self.shape)
-        smooth = rows @ x[:, self.dims].reshape(-1, *self.shape) @ columns.T
-        return smooth.reshape(len(x), -1)
+    def coordinates(self, x: Array) -> Array:
+        xp, n = namespace(x), x.shape[0]
+        down, across = (like(_smoothing(size), x) for size in self.shape)
+        smooth = down @ xp.reshape(columns(x, self.dims), (n, *self.shape)) @ across.T
+        return xp.reshape(smooth, (n, down.shape[0] * across.shape[0]))
 
 
 @cache
@@ -125,31 +126,36 @@ class Kernel:
         """The product of some of the factors."""
         return Kernel(self.factors[chosen], self.lengthscales[chosen])
 
-    def embed(self, x: FloatArray) -> FloatArray:
+    def embed(self, x: Array) -> Array:
         """``e(x)``, (n, m), for inputs (n, d)."""
-        return np.concatenate(
+        return namespace(x).concat(
             [
                 factor.coordinates(x) / lengthscale
-                for factor, lengthscale in zip(self.factors, self.lengthscales, strict=True)
+                for factor, lengthscale in zip(
+                    self.factors, self.lengthscales.tolist(), strict=True
+                )
             ],
             axis=1,
         )
 
-    def gram(self, x: FloatArray, y: FloatArray | None = None) -> FloatArray:
+    def gram(self, x: Array, y: Array | None = None) -> Array:
         """``[k(x_i, y_j)]``, (n, k), for inputs (n, d) and (k, d); ``y`` None means ``x``."""
         return gaussian_gram(self.embed(x), None if y is None else self.embed(y))
 
 
-def gaussian_gram(e: FloatArray, f: FloatArray | None = None) -> FloatArray:
+def gaussian_gram(e: Array, f: Array | None = None) -> Array:
     """``exp(-|e_i - f_j|^2 / 2)`` for coordinates (n, m) and (k, m); ``f`` None means ``e``."""
+    xp = namespace(e)
     # Distances do not feel a common shift, but rounding does: centre first.  On e alone, so that
     # what comes out for one f_j does not depend on the others.
-    centre = e.mean(axis=0)
+    centre = xp.mean(e, axis=0)
     e = e - centre
     f_centred = e if f is None else f - centre
     k = e @ f_centred.T  # NumPy uses the symmetric product when both are one array
-    k -= 0.5 * np.einsum("ij,ij->i", e, e)[:, None]
-    k -= 0.5 * np.einsum("ij,ij->i", f_centred, f_centred)
+    k -= 0.5 * xp.sum(e * e, axis=1)[:, None]
+    k -= 0.5 * xp.sum(f_centred * f_centred, axis=1)
+    if xp is not np:
+        return xp.exp(xp.clip(k, max=0.0))
     np.minimum(k, 0.0, out=k)
     if f is None:
         np.fill_diagonal(k, 0.0)

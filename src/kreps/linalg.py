@@ -1,17 +1,20 @@
 """Dense linear algebra: Cholesky with reported jitter, triangular solves, pivoted Cholesky.
 
-The only file that knows which library does these.
+The only file that knows which library does these: LAPACK for NumPy, the library itself for arrays
+of others.  The array API standard has Cholesky but no triangular solve, hence the three names.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
+import array_api_compat
 import numpy as np
 from scipy.linalg import blas, lapack
 
-from kreps.arrays import FloatArray, IntArray
+from kreps.arrays import Array, FloatArray, IntArray, namespace
 from kreps.errors import NumericalError
 
 _JITTERS = (0.0, 1e-12, 1e-10, 1e-8, 1e-6)
@@ -24,11 +27,13 @@ _ROUNDING = 1e-14
 class Cholesky:
     """``L L' = A + jitter I``, with ``L`` lower triangular (n, n)."""
 
-    lower: FloatArray
+    lower: Array
     jitter: float
 
-    def solve(self, b: FloatArray) -> FloatArray:
+    def solve(self, b: Array) -> Array:
         """``A^-1 b`` for ``b`` of shape (n,) or (n, k)."""
+        if not isinstance(b, np.ndarray):
+            return solve_lower_transposed(self.lower, solve_lower(self.lower, b))
         x, _ = lapack.dpotrs(self.lower, b, lower=1)
         return x
 
@@ -39,7 +44,7 @@ class Cholesky:
         return half + np.tril(half, -1).T
 
 
-def cholesky(a: FloatArray) -> Cholesky:
+def cholesky(a: Array) -> Cholesky:
     """Factorise a symmetric positive definite matrix (n, n).
 
     If rounding has made it indefinite, the least of 1e-12, 1e-10, 1e-8, 1e-6 times its mean
@@ -48,32 +53,78 @@ def cholesky(a: FloatArray) -> Cholesky:
     Raises:
         NumericalError: not positive definite at the largest jitter, or not finite.
     """
-    scale = float(np.mean(np.diagonal(a))) if len(a) else 1.0
+    xp, n = namespace(a), a.shape[0]
+    scale = float(xp.mean(xp.linalg.diagonal(a))) if n else 1.0
+    factorise = _potrf if xp is np else _cholesky_of(xp)
     for relative in _JITTERS if np.isfinite(scale) else ():
         jitter = relative * scale
-        shifted = a + jitter * np.eye(len(a)) if jitter else a
-        lower, info = lapack.dpotrf(shifted, lower=1, clean=1)
-        if info == 0 and np.isfinite(np.diagonal(lower)).all():
+        lower = factorise(with_diagonal(a, jitter) if jitter else a)
+        if lower is not None and bool(xp.all(xp.isfinite(xp.linalg.diagonal(lower)))):
             return Cholesky(lower, jitter)
     raise NumericalError(
-        f"a {len(a)} x {len(a)} matrix with mean diagonal {scale:.3g} is not positive definite, "
+        f"a {n} x {n} matrix with mean diagonal {scale:.3g} is not positive definite, "
         f"even with {_JITTERS[-1]:g} of that added to its diagonal; "
         "check the data for infinities or increase the regularisation"
     )
 
 
-def solve_lower(lower: FloatArray, b: FloatArray) -> FloatArray:
+def _potrf(a: FloatArray) -> FloatArray | None:
+    lower, info = lapack.dpotrf(a, lower=1, clean=1)
+    return lower if info == 0 else None
+
+
+def _cholesky_of(xp: Any) -> Callable[[Array], Array | None]:
+    """Cholesky of another library, None where it refuses."""
+
+    def factorise(a: Array) -> Array | None:
+        try:
+            return xp.linalg.cholesky(a)
+        except (ArithmeticError, ValueError, RuntimeError):  # what the libraries raise
+            return None
+
+    return factorise
+
+
+def with_diagonal(a: Array, added: float | FloatArray) -> Array:
+    """A copy of ``a`` (n, n) with ``added``, a number or (n,), on its diagonal."""
+    xp, n = namespace(a), a.shape[0]
+    if xp is np:
+        shifted = a.copy()
+        shifted.flat[:: n + 1] += added
+        return shifted
+    return a + added * xp.eye(n, dtype=a.dtype, device=array_api_compat.device(a))
+
+
+def solve_lower(lower: Array, b: Array) -> Array:
     """``L^-1 b`` for lower triangular ``L`` (n, n) and ``b`` (n,) or (n, k)."""
+    if not isinstance(b, np.ndarray):
+        return _triangular(lower, b, upper=False)
     if b.ndim == 1 or b.shape[1] == 1:  # the control loop: no threads, no blocking
         return blas.dtrsv(lower, b.ravel(), lower=1).reshape(b.shape)
     return blas.dtrsm(1.0, lower, b, lower=1)
 
 
-def solve_lower_transposed(lower: FloatArray, b: FloatArray) -> FloatArray:
+def solve_lower_transposed(lower: Array, b: Array) -> Array:
     """``L'^-1 b`` for lower triangular ``L`` (n, n) and ``b`` (n,) or (n, k)."""
+    if not isinstance(b, np.ndarray):
+        return _triangular(lower.T, b, upper=True)
     if b.ndim == 1:
         return blas.dtrsv(lower, b, lower=1, trans=1)
     return blas.dtrsm(1.0, lower, b, lower=1, trans_a=1)
+
+
+def _triangular(a: Array, b: Array, *, upper: bool) -> Array:
+    """``a^-1 b`` for a triangular matrix of a library other than NumPy."""
+    xp = namespace(b)
+    if b.ndim == 1:
+        return _triangular(a, b[:, None], upper=upper)[:, 0]
+    if array_api_compat.is_torch_array(b):
+        return xp.linalg.solve_triangular(a, b, upper=upper)
+    if array_api_compat.is_cupy_array(b):
+        from cupyx.scipy.linalg import solve_triangular
+
+        return solve_triangular(a, b, lower=not upper)
+    return xp.linalg.solve(a, b)
 
 
 def inverse_lower(lower: FloatArray) -> FloatArray:

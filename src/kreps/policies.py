@@ -11,7 +11,7 @@ import numpy as np
 from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
 from kreps.errors import ConfigurationError
-from kreps.kernels import Kernel, gaussian_gram
+from kreps.kernels import Kernel
 from kreps.linalg import (
     Cholesky,
     cholesky,
@@ -21,6 +21,8 @@ from kreps.linalg import (
     solve_lower,
     solve_lower_transposed,
 )
+from kreps.sparse_gp import PolicySums, SparseGP
+from kreps.value import RKHSBasis
 
 
 class StochasticPolicy(Protocol):
@@ -122,55 +124,15 @@ class CostSensitiveGP:
         return self.factor.solve(self.targets)
 
     @cached_property
-    def predictor(self) -> Predictor:
-        """What the control loop evaluates."""
-        return Predictor.of(self)
+    def predictor(self) -> SparseGP:
+        """The same process, up to `PIVOT_TOLERANCE`, as the control loop evaluates it.
 
-    def mean(self, states: FloatArray) -> FloatArray:
-        """Mean action (m, da) at states (m, ds), in the task's units, not clipped."""
-        return self.task.unscaled(self.predictor.mean(self.predictor.covariances(states)))
-
-    def greedy(self, states: FloatArray) -> FloatArray:
-        return self.mean(states)
-
-    def standard_deviation(self, states: FloatArray) -> FloatArray:
-        """Standard deviation (m, da) of the commanded action, in the task's units."""
-        spread = self.predictor.standard_deviation(self.predictor.covariances(states))
-        return spread[:, None] * self.task.action_scale
-
-    def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
-        k = self.predictor.covariances(states)
-        spread = self.predictor.standard_deviation(k)
-        return self.task.unscaled(self.predictor.mean(k) + spread[:, None] * noise)
-
-
-@dataclass(frozen=True)
-class Predictor:
-    """Mean and variance of a cost-sensitive GP from its kernel values at r pivots only.
-
-    The kernel of any state with the m support points is, up to `PIVOT_TOLERANCE`, a linear function
-    of its kernel with r of them (the pivots of a Cholesky factorisation), and r << m for smooth
-    kernels.  So both moments become products with (r, r) matrices computed once: a control
-    cycle costs r^2 instead of m^2.
-
-    Attributes:
-        kernel: over states.
-        coordinates: (r, e) embedded pivots.
-        mean_weights: (r, da), the mean is ``k' mean_weights``.
-        explained: (r, r), the explained variance is ``|explained k|^2``.
-        signal, noise: sf2 and l.
-    """
-
-    kernel: Kernel
-    coordinates: FloatArray
-    mean_weights: FloatArray
-    explained: FloatArray
-    signal: float
-    noise: float
-
-    @classmethod
-    def of(cls, policy: CostSensitiveGP) -> Predictor:
-        kernel, states = policy.kernel, policy.states
+        The kernel of any state with the m support points is nearly a linear function of its kernel
+        with r of them (the pivots of a Cholesky factorisation), and r << m for smooth kernels.
+        So both moments become products with (r, r) matrices computed once: a control cycle costs
+        r^2 instead of m^2.
+        """
+        kernel, states = self.kernel, self.states
         chosen = pivoted_cholesky(
             np.ones(len(states)),
             lambda rows: kernel.gram(states, states[rows]),
@@ -178,39 +140,54 @@ class Predictor:
             max_rank=len(states) // 2,
         )
         if chosen.residual > PIVOT_TOLERANCE:  # not so smooth: all support points are pivots
-            return cls(
-                kernel,
-                kernel.embed(states),
-                policy.signal * policy.alpha,
-                policy.signal * inverse_lower(policy.factor.lower),
-                policy.signal,
-                policy.noise,
-            )
-        # k(states, s) = columns phi(s) with phi(s) = lower^-1 k(pivots, s)
-        lower = np.tril(chosen.columns[chosen.pivots])
-        columns = policy.signal * chosen.columns
-        mean_weights = solve_lower_transposed(lower, columns.T @ policy.alpha)
-        # k' C^-1 k = |L^-1 columns phi|^2 = |R phi|^2 with R from the QR of L^-1 columns
-        r = qr_factor(solve_lower(policy.factor.lower, columns))
-        return cls(
-            kernel,
-            kernel.embed(states[chosen.pivots]),
-            mean_weights,
-            np.ascontiguousarray(solve_lower_transposed(lower, r.T).T),
-            policy.signal,
-            policy.noise,
+            centres = states
+            mean_weights = self.signal * self.alpha
+            explained = self.signal * inverse_lower(self.factor.lower)
+        else:
+            # k(states, s) = columns phi(s) with phi(s) = lower^-1 k(pivots, s)
+            centres = states[chosen.pivots]
+            lower = np.tril(chosen.columns[chosen.pivots])
+            columns = self.signal * chosen.columns
+            mean_weights = solve_lower_transposed(lower, columns.T @ self.alpha)
+            # k' C^-1 k = |L^-1 columns phi|^2 = |R phi|^2 with R from the QR of L^-1 columns
+            r = qr_factor(solve_lower(self.factor.lower, columns))
+            explained = np.ascontiguousarray(solve_lower_transposed(lower, r.T).T)
+        return SparseGP(
+            self.task, kernel, centres, mean_weights, explained, self.signal, self.noise
         )
 
-    def covariances(self, states: FloatArray) -> FloatArray:
-        """Kernel values (r, m) of the pivots with states (m, ds)."""
-        return gaussian_gram(self.coordinates, self.kernel.embed(states))
+    def mean(self, states: FloatArray) -> FloatArray:
+        """Mean action (m, da) at states (m, ds), in the task's units, not clipped."""
+        return self.predictor.greedy(states)
 
-    def mean(self, k: FloatArray) -> FloatArray:
-        """(m, da), scaled."""
-        return k.T @ self.mean_weights
+    def greedy(self, states: FloatArray) -> FloatArray:
+        return self.predictor.greedy(states)
 
-    def standard_deviation(self, k: FloatArray) -> FloatArray:
-        """(m,), scaled: ``sqrt(sf2 - k' C^-1 k + l)``."""
-        explained = self.explained @ k
-        variance = self.signal - np.einsum("ij,ij->j", explained, explained)
-        return np.sqrt(np.maximum(variance, 0.0) + self.noise)
+    def standard_deviation(self, states: FloatArray) -> FloatArray:
+        """Standard deviation (m, da) of the commanded action, in the task's units."""
+        return self.predictor.standard_deviation(states)
+
+    def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
+        return self.predictor.act(states, noise)
+
+    def compressed(self, centres: int) -> SparseGP:
+        """This policy on at most ``centres`` support points, for small computers.
+
+        All samples still count: it is the posterior of the projected process, whose variance far
+        from the centres is that of the prior.
+
+        Raises:
+            ConfigurationError: fewer than one centre.
+        """
+        if centres < 1:
+            raise ConfigurationError(f"centres = {centres}, but a policy needs at least one")
+        basis, features = RKHSBasis.fit(
+            self.kernel, self.states, tolerance=PIVOT_TOLERANCE, max_rank=centres
+        )
+        return SparseGP.fit(
+            self.task,
+            basis,
+            PolicySums.of(features, self.weights, self.targets),
+            self.signal,
+            self.noise,
+        )

@@ -1,0 +1,118 @@
+"""A Gaussian process policy carried by few centres: what the control loop evaluates.
+
+It comes about in three ways: from an exact process without loss (`CostSensitiveGP.predictor`), from
+one with bounded size (`CostSensitiveGP.compressed`), or from sums over any number of samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from kreps.arrays import FloatArray
+from kreps.data import TaskSpec
+from kreps.kernels import Kernel, gaussian_gram
+from kreps.linalg import solve_lower_transposed
+from kreps.value import RKHSBasis
+
+
+@dataclass(frozen=True)
+class PolicySums:
+    """What weighted samples say about actions as a linear function of features z, (r,).
+
+    Attributes:
+        precision: (r, r), ``sum_i w_i z_i z_i'``.
+        pull: (r, da), ``sum_i w_i z_i u_i'``.
+    """
+
+    precision: FloatArray
+    pull: FloatArray
+
+    @classmethod
+    def of(cls, features: FloatArray, weights: FloatArray, targets: FloatArray) -> PolicySums:
+        """Of features (n, r), weights (n,) and scaled actions (n, da)."""
+        weighted = np.sqrt(weights)[:, None] * features
+        return cls(weighted.T @ weighted, features.T @ (weights[:, None] * targets))
+
+    def __add__(self, other: PolicySums) -> PolicySums:
+        return PolicySums(self.precision + other.precision, self.pull + other.pull)
+
+
+@dataclass(frozen=True)
+class SparseGP:
+    """Mean and variance of actions from the kernel values ``k`` of a state with r centres only.
+
+    Attributes:
+        task: gives centre, scale and limits of the actions.
+        kernel: over states.
+        states: (r, ds) the centres.
+        mean_weights: (r, da), the scaled mean is ``k' mean_weights``.
+        explained: (r, r), the explained variance is ``|explained k|^2``.
+        signal, noise: sf2 and l.
+    """
+
+    task: TaskSpec
+    kernel: Kernel
+    states: FloatArray
+    mean_weights: FloatArray
+    explained: FloatArray
+    signal: float
+    noise: float
+
+    @classmethod
+    def fit(
+        cls, task: TaskSpec, basis: RKHSBasis, sums: PolicySums, signal: float, noise: float
+    ) -> SparseGP:
+        """The posterior of the projected process (deterministic training conditional).
+
+        With features ``z(s)`` of the basis and ``P = I + (sf2 / l) sum_i w_i z_i z_i'``:
+        ``mu(s) = (sf2 / l) z(s)' P^-1 sum_i w_i z_i u_i`` and
+        ``sigma^2(s) = sf2 (1 - z(s)' z(s)) + sf2 z(s)' P^-1 z(s) + l``.
+        The first part of the variance is what the centres cannot represent; without it (subset
+        of regressors) the policy would grow sure of itself far from all data.
+        """
+        values, vectors = np.linalg.eigh(signal / noise * sums.precision)
+        values = np.maximum(values, 0.0)
+        mean = vectors @ ((vectors.T @ sums.pull) / (1.0 + values)[:, None])
+        # I - P^-1 = vectors diag(values / (1 + values)) vectors'
+        explained = np.sqrt(signal * values / (1.0 + values)) * vectors
+        return cls(
+            task,
+            basis.kernel,
+            basis.pivots,
+            solve_lower_transposed(basis.lower, signal / noise * mean),
+            np.ascontiguousarray(solve_lower_transposed(basis.lower, explained).T),
+            signal,
+            noise,
+        )
+
+    @cached_property
+    def coordinates(self) -> FloatArray:
+        """Embedded centres (r, e)."""
+        return self.kernel.embed(self.states)
+
+    def greedy(self, states: FloatArray) -> FloatArray:
+        """Mean action (m, da) at states (m, ds), in the task's units, not clipped."""
+        return self.task.unscaled(self._mean(self._covariances(states)))
+
+    def standard_deviation(self, states: FloatArray) -> FloatArray:
+        """Standard deviation (m, da) of the commanded action, in the task's units."""
+        return self._deviation(self._covariances(states))[:, None] * self.task.action_scale
+
+    def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
+        k = self._covariances(states)
+        return self.task.unscaled(self._mean(k) + self._deviation(k)[:, None] * noise)
+
+    def _covariances(self, states: FloatArray) -> FloatArray:
+        """Kernel values (r, m) of the centres with states (m, ds)."""
+        return gaussian_gram(self.coordinates, self.kernel.embed(states))
+
+    def _mean(self, k: FloatArray) -> FloatArray:
+        return k.T @ self.mean_weights
+
+    def _deviation(self, k: FloatArray) -> FloatArray:
+        explained = self.explained @ k
+        variance = self.signal - np.einsum("ij,ij->j", explained, explained)
+        return np.sqrt(np.maximum(variance, 0.0) + self.noise)
