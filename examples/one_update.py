@@ -43,7 +43,7 @@ from kreps.envs.restart import restart_length
 from kreps.plotting import BLUE, GREY, ORANGE, STYLE
 from kreps.policies import CostSensitiveGP, Gaussian, StochasticPolicy
 from kreps.settings import Settings
-from kreps.value import RKHSBasis, ValueFunction
+from kreps.value import KernelExpansion, RKHSBasis
 
 NOTEBOOK = "ipykernel" in sys.modules
 parser = argparse.ArgumentParser(
@@ -295,7 +295,7 @@ in_units = np.column_stack([pair[:, :1], task.scaled(task.clip(pair[:, 1:]))])
 beta = model.strengths(in_units)[:, 0]
 
 goal = np.zeros((1, 1))
-near_goal = ValueFunction(kernel, goal, np.ones(1))  # f
+near_goal = KernelExpansion(kernel, goal, np.ones(1))  # f
 after = data.points[data.successor]
 observed_f, own_f = near_goal(after), near_goal(data.states)
 embedded_f = own_f + model.strengths(model.inputs).T @ (observed_f - own_f)
@@ -307,7 +307,7 @@ embedded_at_pair = at_pair + moved @ beta
 nodes, node_weights = np.polynomial.hermite_e.hermegauss(20)  # for expectations under the noise
 
 
-def true_expectation(function: ValueFunction) -> FloatArray:
+def true_expectation(function: KernelExpansion) -> FloatArray:
     """E[f(s') | s_i, a_i] by the true motion and quadrature: for comparison only."""
     mean = data.states + PERIOD * task.clip(data.actions)
     values = [function(wrap(mean + NOISE * node)) for node in nodes]
@@ -448,7 +448,7 @@ show(figure, "4_dual")
 #
 # The multiplier `theta` makes a function of the state, the *value function*
 # `V(s) = phi(s)' theta`: how much future reward a state promises, up to a constant
-# ([`ValueFunction`](../src/kreps/value.py)). So `delta_i` is the Bellman error
+# ([`KernelExpansion`](../src/kreps/value.py)). So `delta_i` is the Bellman error
 # `r_i + E[V(s') | s_i, a_i] - V(s_i)`, restarts included: what the action brings now and later,
 # compared with what the state promised ([`bellman_errors`](../src/kreps/dual.py)). The weights are
 # (Eq. 1)
@@ -467,7 +467,7 @@ show(figure, "4_dual")
 # %%
 delta = bellman_errors(problem, dual.theta)
 p = dual.weights
-value = basis.value_function(reward_unit * dual.theta)  # in units of the reward
+value = basis.function(reward_unit * dual.theta)  # in units of the reward
 greedy_p = sample_weights(problem.rewards, dual.eta)  # as if there were no future
 
 

@@ -358,7 +358,7 @@ def test_a_setting_of_another_method_is_unknown() -> None:
 NAN, INF = float("nan"), float("inf")
 OUT_OF_RANGE: list[tuple[str, str, Any]] = [
     *((method, "restart_probability", v) for method in METHODS for v in (0.0, 1.0, NAN, "p")),
-    *((method, "window", v) for method in METHODS for v in (0, 2.5, True, None)),
+    *((method, "window", v) for method in METHODS for v in (0, 2.5, True, "all")),
     *((method, "initial_rollouts", 0) for method in METHODS if method != GRID),
     *((method, "rollouts_per_iteration", 1.5) for method in METHODS if method != GRID),
     *((method, "exploration", "none") for method in METHODS if method != GRID),

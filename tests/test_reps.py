@@ -233,7 +233,8 @@ def test_policy_hyperparameters_are_the_most_probable_ones() -> None:
     """Leave-one-out loss plus ``1/2 sum ((x - c) / sd)^2 / sum w``, minimised afresh by BFGS."""
     rng = np.random.default_rng(13)
     states, targets = rng.normal(size=(25, 2)), rng.normal(0.0, 0.8, size=(25, 1))
-    samples = PolicySamples(states, targets, rng.uniform(0.2, 2.0, 25))
+    weights = rng.uniform(0.2, 2.0, 25)
+    samples = PolicySamples(states, targets, weights, float(weights.sum()))
     kernel = Kernel(factors_of(2), np.array([0.9, 1.4]))
     found = policy_hyperparameters(samples, kernel, settings_of(), None, rng)
 
@@ -260,7 +261,7 @@ def test_bounded_policy_hyperparameters_keep_to_their_ranges() -> None:
     high = np.log([0.9, 1.4, 3.0, 4.0])
     # Pure noise asks for a long lengthscale, targets all zero for no variance.
     for targets in (rng.normal(size=(40, 1)), np.zeros((40, 1)), 100.0 * states[:, :1]):
-        samples = PolicySamples(states, targets, np.ones(40))
+        samples = PolicySamples(states, targets, np.ones(40), 40.0)
         found = policy_hyperparameters(samples, kernel, settings_of("paper"), None, rng)
         assert (found >= low - 1e-12).all()
         assert (found <= high + 1e-12).all()

@@ -58,7 +58,7 @@ def test_duplicated_states_add_no_feature() -> None:
 def test_the_value_function_is_the_product_of_features_and_theta() -> None:
     basis, features = RKHSBasis.fit(KERNEL, states(200, 5), tolerance=1e-5, max_rank=400)
     theta = np.random.default_rng(6).normal(size=(features.shape[1],))
-    value = basis.value_function(theta)
+    value = basis.function(theta)
     new = states(40, 7)
     np.testing.assert_allclose(value(new), basis.features(new) @ theta, atol=1e-8)
     np.testing.assert_allclose(value(states(200, 5)), features @ theta, atol=1e-8)
@@ -67,14 +67,14 @@ def test_the_value_function_is_the_product_of_features_and_theta() -> None:
 def test_the_squared_norm_of_the_value_function_is_that_of_theta() -> None:
     basis, features = RKHSBasis.fit(KERNEL, states(100, 8), tolerance=1e-4, max_rank=400)
     theta = np.random.default_rng(9).normal(size=(features.shape[1],))
-    value = basis.value_function(theta)
+    value = basis.function(theta)
     norm = value.alpha @ KERNEL.gram(value.centres) @ value.alpha
     assert norm == pytest.approx(theta @ theta, rel=1e-8)
 
 
 def test_the_value_function_is_periodic_where_its_kernel_is() -> None:
     basis, features = RKHSBasis.fit(KERNEL, states(100, 10), tolerance=1e-4, max_rank=400)
-    value = basis.value_function(np.ones(features.shape[1]))
+    value = basis.function(np.ones(features.shape[1]))
     new = states(20, 11)
     turn = 2.0 * np.pi * np.eye(2)
     np.testing.assert_allclose(value(new + turn[0]), value(new), atol=1e-7)
@@ -97,7 +97,7 @@ def test_a_grid_of_radial_basis_functions() -> None:
     )
     np.testing.assert_allclose(grid.features(new), wanted, atol=1e-12)
     theta = np.array([1.0, -2.0, 0.5])
-    np.testing.assert_allclose(grid.value_function(theta)(new), wanted @ theta, atol=1e-12)
+    np.testing.assert_allclose(grid.function(theta)(new), wanted @ theta, atol=1e-12)
 
 
 def test_a_grid_over_data_has_its_lengthscale_for_spacing() -> None:

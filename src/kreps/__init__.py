@@ -22,8 +22,10 @@ from kreps.errors import (
 )
 
 if TYPE_CHECKING:
+    from kreps.compute import Compute
     from kreps.controller import Policy, load_policy
     from kreps.data import Rollout, TaskSpec
+    from kreps.dataset import Dataset
     from kreps.envs.restart import RandomRestart
     from kreps.learner import (
         KREPS,
@@ -33,13 +35,16 @@ if TYPE_CHECKING:
         ValueIteration,
     )
     from kreps.settings import RECIPES, Settings
+    from kreps.storage import load_rollouts, rollout_folder, save_rollouts
 
 __all__ = [
     "KREPS",
     "NPALP",
     "RECIPES",
+    "Compute",
     "ConfigurationError",
     "DataError",
+    "Dataset",
     "EnvironmentFailure",
     "GridValueIteration",
     "IterationReport",
@@ -54,6 +59,9 @@ __all__ = [
     "TaskSpec",
     "ValueIteration",
     "load_policy",
+    "load_rollouts",
+    "rollout_folder",
+    "save_rollouts",
 ]
 
 __version__ = "0.1.0"
@@ -71,6 +79,11 @@ _HOMES = {
     "RandomRestart": "envs.restart",
     "RECIPES": "settings",
     "Settings": "settings",
+    "Compute": "compute",
+    "Dataset": "dataset",
+    "load_rollouts": "storage",
+    "rollout_folder": "storage",
+    "save_rollouts": "storage",
     "Rollout": "data",
     "TaskSpec": "data",
 }

@@ -55,6 +55,14 @@ def columns(array: Array, chosen: Sequence[int]) -> Array:
     return xp.take(array, xp.asarray(chosen, device=array_api_compat.device(array)), axis=1)
 
 
+def rows(array: Array, chosen: IntArray) -> Array:
+    """``array[chosen]``."""
+    if isinstance(array, np.ndarray):
+        return array[chosen]
+    xp = namespace(array)
+    return xp.take(array, xp.asarray(chosen, device=array_api_compat.device(array)), axis=0)
+
+
 def grid_points(axes: Sequence[FloatArray]) -> FloatArray:
     """Every combination (m, d) of one value of each of d axes; the last axis runs fastest."""
     return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)

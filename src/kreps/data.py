@@ -258,16 +258,51 @@ class Transitions:
             terminated=terminated,
         )
 
+    @classmethod
+    def joined(cls, parts: Sequence[Transitions]) -> Transitions:
+        """All steps of at least one set of them, in order."""
+        if len(parts) == 1:
+            return parts[0]
+        before = np.cumsum([0, *(len(part.points) for part in parts[:-1])])
+        return cls(
+            points=np.concatenate([part.points for part in parts]),
+            state=np.concatenate([p.state + b for p, b in zip(parts, before, strict=True)]),
+            successor=np.concatenate([p.successor + b for p, b in zip(parts, before, strict=True)]),
+            start=np.concatenate([p.start + b for p, b in zip(parts, before, strict=True)]),
+            actions=np.concatenate([part.actions for part in parts]),
+            rewards=np.concatenate([part.rewards for part in parts]),
+            terminated=np.concatenate([part.terminated for part in parts]),
+        )
+
+    def rows(self, chosen: IntArray) -> Transitions:
+        """Some of the steps, with the start states of the roll-outs that they are of."""
+        if len(chosen) == len(self):
+            return self
+        k = len(chosen)
+        of = np.unique(np.searchsorted(self.start, self.state[chosen], side="right") - 1)
+        named = (self.state[chosen], self.successor[chosen], self.start[of])
+        return Transitions(
+            points=self.points[np.concatenate(named)],
+            state=np.arange(k),
+            successor=k + np.arange(k),
+            start=2 * k + np.arange(len(of)),
+            actions=self.actions[chosen],
+            rewards=self.rewards[chosen],
+            terminated=self.terminated[chosen],
+        )
+
 
 @dataclass(frozen=True)
 class Window:
-    """The latest ``capacity`` roll-outs: the forgetting mechanism of Sec. 4.1."""
+    """The latest ``capacity`` roll-outs: the forgetting mechanism of Sec. 4.1; None keeps all."""
 
-    capacity: int
+    capacity: int | None
     rollouts: tuple[Rollout, ...] = field(default=())
 
     def extend(self, rollouts: Iterable[Rollout]) -> Window:
-        kept = (*self.rollouts, *rollouts)[-self.capacity :]
+        kept = (*self.rollouts, *rollouts)
+        if self.capacity is not None:
+            kept = kept[-self.capacity :]
         return Window(self.capacity, kept)
 
     @cached_property

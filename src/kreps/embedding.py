@@ -6,12 +6,14 @@ features of the successor of each sampled state and action?
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from kreps.arrays import Array
+from kreps.arrays import Array, FloatArray, as_numpy
 from kreps.kernels import Kernel
 from kreps.linalg import Cholesky, cholesky, with_diagonal
+from kreps.value import Basis
 
 
 class TransitionModel(Protocol):
@@ -60,3 +62,45 @@ class SampleModel:
 
     def expected_features(self, successor_features: Array) -> Array:
         return successor_features
+
+
+@dataclass(frozen=True)
+class RegressionSums:
+    """What samples say of features as linear functions of features; sums over chunks add up.
+
+    Attributes:
+        gram: (q, q) ``Psi'Psi``.
+        product: (q, r) ``Psi'F'``.
+    """
+
+    gram: FloatArray
+    product: FloatArray
+
+    @classmethod
+    def of(cls, psi: Array, targets: Array) -> RegressionSums:
+        """Of features (n, q) of states and actions and their targets (n, r)."""
+        return cls(as_numpy(psi.T @ psi), as_numpy(psi.T @ targets))
+
+    def __add__(self, other: RegressionSums) -> RegressionSums:
+        return RegressionSums(self.gram + other.gram, self.product + other.product)
+
+
+@dataclass(frozen=True)
+class FeatureRegression:
+    """Eq. 4 in q features psi of states and actions: ``mu(s, a) = coefficients' psi(s, a)``.
+
+    With ``coefficients = (Psi'Psi + lambda I)^-1 Psi'F'`` it is the embedding of the kernel
+    ``psi'psi`` at a cost of n q^2 instead of n^3.
+
+    Attributes:
+        mean: mu (n, r) as a function of states and applied actions (n, ds + da).
+        jitter: of the factorisation.
+    """
+
+    mean: Callable[[Array], Array]
+    jitter: float
+
+    @classmethod
+    def fit(cls, basis: Basis, sums: RegressionSums, regulariser: float) -> FeatureRegression:
+        factor = cholesky(with_diagonal(sums.gram, regulariser))
+        return cls(basis.function(factor.solve(sums.product)), factor.jitter)

@@ -15,11 +15,13 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import numpy as np
 
 from kreps import storage
-from kreps.algorithms import npalp, reps, value_iteration
+from kreps.algorithms import low_rank_reps, npalp, reps, value_iteration
 from kreps.algorithms.state import LearnerState, UpdateReport
 from kreps.arrays import FloatArray
+from kreps.compute import Compute
 from kreps.controller import Policy
 from kreps.data import Rollout, TaskSpec, Window
+from kreps.dataset import Dataset
 from kreps.errors import ConfigurationError, DataError
 from kreps.policies import MAX_SUPPORT, BangBang, Gaussian, StochasticPolicy
 from kreps.rollout import Environment, collect, collect_grid, task_of, without_restarts
@@ -35,7 +37,7 @@ from kreps.settings import (
     settings_of,
 )
 from kreps.threads import blas_threads
-from kreps.value import ValueFunction
+from kreps.value import LinearFunction
 
 
 def _whole(name: str, value: Any) -> int:
@@ -236,10 +238,13 @@ class Learner(Generic[MethodSettings]):
             raise DataError("there is no new roll-out to learn from; give at least one")
         rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
         with blas_threads(self.threads):
-            self.state, info = type(self).algorithm(
-                self.state, rollouts, self.task, self.settings, rng
-            )
+            self.state, info = self._updated(rollouts, rng)
         return info
+
+    def _updated(
+        self, rollouts: list[Rollout], rng: np.random.Generator
+    ) -> tuple[LearnerState, UpdateReport]:
+        return type(self).algorithm(self.state, rollouts, self.task, self.settings, rng)
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
         """The next iteration's data."""
@@ -323,6 +328,7 @@ class KREPS(OnPolicyLearner[Settings]):
         env, seed, periodic, threads: as of `Learner`.
         recipe: ``"default"``, ``"paper"`` (close to the printed method), ``"images"`` (for
             observations that are pictures) or a `kreps.Settings`.
+        compute: who works on the chunks of updates of low rank, and in which arrays.
         **settings: any field of `kreps.Settings`, such as ``kl_bound``.
 
     Raises:
@@ -342,16 +348,53 @@ class KREPS(OnPolicyLearner[Settings]):
         recipe: str | Settings = "default",
         periodic: Sequence[int] | None = None,
         threads: int | None = 1,
+        compute: Compute | None = None,
         **settings: Any,
     ) -> None:
         self._recipe = recipe
+        self.compute = compute or Compute()
         super().__init__(env, seed=seed, periodic=periodic, threads=threads, **settings)
 
     def _settings(self, changes: dict[str, Any]) -> Settings:
         return settings_of(self._recipe, **changes)
 
+    def update(self, rollouts: Iterable[Rollout] | Dataset) -> UpdateReport:
+        """One update from roll-outs collected anywhere; those kept from before count too.
+
+        Args:
+            rollouts: at least one; their actions as commanded, before any clipping.  Or a
+                `kreps.Dataset` of any size, which is learnt from alone and not kept.
+
+        Raises:
+            DataError: not roll-outs, none of them, or of other widths than the task's.
+            ConfigurationError: a data set with ``approximation="exact"``.
+        """
+        if not isinstance(rollouts, Dataset):
+            return super().update(rollouts)
+        if self.settings.approximation == "exact":
+            raise ConfigurationError(
+                'approximation = "exact", but a data set is learnt from in chunks; choose '
+                'another, such as "pivoted", or give a list of roll-outs'
+            )
+        rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
+        with blas_threads(self.threads):
+            self.state, info = low_rank_reps.update(
+                self.state, rollouts, self.task, self.settings, rng, self.compute
+            )
+        return info
+
+    def _updated(
+        self, rollouts: list[Rollout], rng: np.random.Generator
+    ) -> tuple[LearnerState, UpdateReport]:
+        samples = sum(map(len, self.state.window.extend(rollouts).rollouts))
+        if not low_rank_reps.applies(self.settings, samples):
+            return super()._updated(rollouts, rng)
+        return low_rank_reps.update(
+            self.state, rollouts, self.task, self.settings, rng, self.compute
+        )
+
     @property
-    def value_function(self) -> ValueFunction:
+    def value_function(self) -> LinearFunction:
         """V of the last update (Eq. 3), in units of the reward.
 
         Raises:
@@ -397,7 +440,7 @@ class GridValueIteration(Learner[GridValueIterationSettings]):
             settings.ranges,
             settings.grid_states,
             settings.grid_actions,
-            most=min(settings.window, MAX_SUPPORT),
+            most=min(settings.window or MAX_SUPPORT, MAX_SUPPORT),
             seed=self.seed,
             iteration=self.state.iteration,
         )

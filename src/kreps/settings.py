@@ -10,6 +10,7 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args
 from kreps.errors import ConfigurationError
 
 Model = Literal["change", "embedding", "sample"]
+Approximation = Literal["auto", "exact", "pivoted", "uniform", "fourier"]
 Features = Literal["rkhs", "grid"]
 PolicyFit = Literal["map", "bounded"]
 Exploration = Literal["bang-bang", "gaussian"]
@@ -21,15 +22,16 @@ class LearnerSettings:
 
     Attributes:
         restart_probability: p, with which the process restarts at each step.
-        window: how many of the latest roll-outs are kept.
+        window: how many of the latest roll-outs are kept; None keeps all.
     """
 
     restart_probability: float = 0.02
-    window: int = 30
+    window: int | None = 30
 
     def __post_init__(self) -> None:
         self._check("restart_probability", Real, "in (0, 1)", lambda v: 0 < v < 1)
-        self._whole("window")
+        if self.window is not None:
+            self._whole("window")
 
     def _choose(self, name: str, kind: Any) -> None:
         if getattr(self, name) not in get_args(kind):
@@ -105,6 +107,12 @@ class Settings(OnPolicySettings):
             or ``"bounded"`` within hard ranges.
         max_rank: most features of V.
         basis_tolerance: the basis of V is complete when no state has a larger squared residual.
+        approximation: ``"exact"``, or features in place of kernels: Nystroem's with pivots
+            chosen by pivoted Cholesky (``"pivoted"``) or at random (``"uniform"``), or random
+            Fourier features (``"fourier"``; the policy then has Nystroem's, chosen by pivots).
+            ``"auto"`` is exact up to 3000 samples and pivoted above.
+        rank: most features of states and actions and most centres of the policy where they are
+            approximated; V has ``max_rank``.
     """
 
     kl_bound: float = 1.0
@@ -116,15 +124,18 @@ class Settings(OnPolicySettings):
     policy_fit: PolicyFit = "map"
     max_rank: int = 400
     basis_tolerance: float = 1e-6
+    approximation: Approximation = "auto"
+    rank: int = 1000
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._choose("model", Model)
         self._choose("features", Features)
         self._choose("policy_fit", PolicyFit)
+        self._choose("approximation", Approximation)
         self._positive("kl_bound", "ridge", "basis_tolerance")
         self._not_negative("eta_floor")
-        self._whole("max_rank", "grid_size")
+        self._whole("max_rank", "grid_size", "rank")
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,14 @@ from functools import cached_property
 
 import numpy as np
 
-from kreps.arrays import FloatArray
+from kreps.arrays import Array, FloatArray, as_numpy, namespace
 from kreps.data import TaskSpec
-from kreps.kernels import Kernel, gaussian_gram
+from kreps.kernels import Kernel
 from kreps.linalg import solve_lower_transposed
 from kreps.value import RKHSBasis
+
+ROWS = 128
+"""Of a triangular matrix that are multiplied at once."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +34,11 @@ class PolicySums:
     pull: FloatArray
 
     @classmethod
-    def of(cls, features: FloatArray, weights: FloatArray, targets: FloatArray) -> PolicySums:
-        """Of features (n, r), weights (n,) and scaled actions (n, da)."""
-        weighted = np.sqrt(weights)[:, None] * features
-        return cls(weighted.T @ weighted, features.T @ (weights[:, None] * targets))
+    def of(cls, features: Array, weights: Array, targets: Array) -> PolicySums:
+        """Of features (n, r), weights (n,) and scaled actions (n, da), of any array library."""
+        root = namespace(features).sqrt(weights)[:, None]
+        weighted = root * features
+        return cls(as_numpy(weighted.T @ weighted), as_numpy(weighted.T @ (root * targets)))
 
     def __add__(self, other: PolicySums) -> PolicySums:
         return PolicySums(self.precision + other.precision, self.pull + other.pull)
@@ -93,6 +97,22 @@ class SparseGP:
         """Embedded centres (r, e)."""
         return self.kernel.embed(self.states)
 
+    @cached_property
+    def _centred(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean (e,) of the coordinates, distances (r, e) from it, half of their squares (r,)."""
+        origin = self.coordinates.mean(axis=0)
+        centred = self.coordinates - origin
+        return origin, centred, 0.5 * np.sum(centred * centred, axis=1)
+
+    @cached_property
+    def _explained_rows(self) -> list[FloatArray]:
+        """`explained` in pieces, of which a triangular one has fewer columns: half the work."""
+        triangular = len(self.explained) > ROWS and not np.triu(self.explained, 1).any()
+        if not triangular:
+            return [self.explained]
+        starts = range(0, len(self.explained), ROWS)
+        return [self.explained[i : i + ROWS, : i + ROWS] for i in starts]
+
     def greedy(self, states: FloatArray) -> FloatArray:
         """Mean action (m, da) at states (m, ds), in the task's units, not clipped."""
         return self.task.unscaled(self._mean(self._covariances(states)))
@@ -106,13 +126,25 @@ class SparseGP:
         return self.task.unscaled(self._mean(k) + self._deviation(k)[:, None] * noise)
 
     def _covariances(self, states: FloatArray) -> FloatArray:
-        """Kernel values (r, m) of the centres with states (m, ds)."""
-        return gaussian_gram(self.coordinates, self.kernel.embed(states))
+        """Kernel values (r, m) of the centres with states (m, ds).
+
+        As `gaussian_gram` of both, to the last bit, but what depends on the centres alone is not
+        computed again in each cycle.
+        """
+        origin, centred, half_squares = self._centred
+        f = self.kernel.embed(states) - origin
+        k = centred @ f.T
+        k -= half_squares[:, None]
+        k -= 0.5 * np.sum(f * f, axis=1)
+        np.minimum(k, 0.0, out=k)
+        return np.exp(k, out=k)
 
     def _mean(self, k: FloatArray) -> FloatArray:
         return k.T @ self.mean_weights
 
     def _deviation(self, k: FloatArray) -> FloatArray:
-        explained = self.explained @ k
-        variance = self.signal - np.einsum("ij,ij->j", explained, explained)
+        variance = np.full(k.shape[1], self.signal)
+        for rows in self._explained_rows:
+            explained = rows @ k[: rows.shape[1]]
+            variance -= np.einsum("ij,ij->j", explained, explained)
         return np.sqrt(np.maximum(variance, 0.0) + self.noise)

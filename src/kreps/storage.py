@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import asdict
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +21,15 @@ import safetensors.numpy
 
 from kreps.algorithms.state import LearnerState
 from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Window, is_sane
-from kreps.errors import KrepsError, StorageError
+from kreps.data import Rollout, TaskSpec, Transitions, Window, is_sane
+from kreps.dataset import Dataset
+from kreps.errors import DataError, KrepsError, StorageError
 from kreps.kernels import Kernel
 from kreps.policies import MAX_SUPPORT, CostSensitiveGP, LearntPolicy
 from kreps.settings import AnySettings, LearnerSettings
+from kreps.sparse_gp import SparseGP
 from kreps.threads import blas_threads
-from kreps.value import ValueFunction
+from kreps.value import FourierExpansion, KernelExpansion, LinearFunction
 from kreps.value_policies import LipschitzPolicy, SoftmaxPolicy
 
 VERSION = 2
@@ -40,6 +42,8 @@ POLICY_ARRAYS = {
     "policy.targets",
     "policy.weights",
     "policy.signal_and_noise",
+    "policy.mean_weights",
+    "policy.explained",
     "policy.table",
     "policy.candidates",
     "policy.offset_and_temperature",
@@ -47,19 +51,27 @@ POLICY_ARRAYS = {
     "policy.bounds",
     "policy.slope_and_noise",
 }
-CHECKPOINT_ARRAYS = POLICY_ARRAYS | {
-    "value.lengthscales",
-    "value.centres",
-    "value.alpha",
+ROLLOUT_ARRAYS = {
     "window.lengths",
     "window.terminated",
     "window.observations",
     "window.actions",
     "window.rewards",
-    "start.policy",
-    "start.embedding",
 }
-ARRAYS = {"policy": POLICY_ARRAYS, "checkpoint": CHECKPOINT_ARRAYS}
+CHECKPOINT_ARRAYS = (
+    POLICY_ARRAYS
+    | ROLLOUT_ARRAYS
+    | {
+        "value.lengthscales",
+        "value.centres",
+        "value.alpha",
+        "value.frequencies",
+        "value.theta",
+        "start.policy",
+        "start.embedding",
+    }
+)
+ARRAYS = {"policy": POLICY_ARRAYS, "rollouts": ROLLOUT_ARRAYS, "checkpoint": CHECKPOINT_ARRAYS}
 
 Tensors = dict[str, FloatArray]
 Header = dict[str, Any]
@@ -106,6 +118,16 @@ def write_arrays(path: Path, kind: str, tensors: Tensors, header: Header) -> Non
     write_atomically(path, content)
 
 
+def read_header(path: Path, kind: str) -> Header:
+    """What `write_arrays` wrote beside the arrays.
+
+    Raises:
+        StorageError: missing, unreadable, damaged, too large, or of another kind or version.
+    """
+    with _reading(path, kind) as file:
+        return _header(file.metadata(), kind)
+
+
 def read_arrays(path: Path, kind: str) -> tuple[Tensors, Header]:
     """Read what `write_arrays` wrote.
 
@@ -113,27 +135,40 @@ def read_arrays(path: Path, kind: str) -> tuple[Tensors, Header]:
         StorageError: missing, unreadable, damaged, too large, of another kind or version, or
             holding anything but finite float64 arrays.
     """
+    with _reading(path, kind) as file:
+        header = _header(file.metadata(), kind)
+        names = list(file.keys())
+        for name in names:
+            if name not in ARRAYS[kind]:
+                raise StorageError(f"a {kind} has no array {name!r:.60}")
+            if file.get_slice(name).get_dtype() != "F64":
+                raise StorageError(f"array {name!r} is not of 64-bit floats")
+        promised = header.get("arrays")
+        if not isinstance(promised, list):
+            raise StorageError("its header does not name its arrays")
+        missing = [n for n in promised if n not in names]
+        if missing:
+            raise StorageError(f"array {missing[0]!r:.60} is missing")
+        if len(promised) != len(names):
+            raise StorageError("it holds arrays that its header does not name")
+        tensors = {n: np.asarray(file.get_tensor(n)) for n in names}
+    for name, values in tensors.items():
+        if not is_sane(values).all():
+            raise StorageError(
+                f"{path} holds NaN, infinities or absurdly large numbers in {name!r}: it is damaged"
+            )
+    return tensors, header
+
+
+@contextmanager
+def _reading(path: Path, kind: str) -> Iterator[Any]:
+    """The open file; whatever goes wrong comes out as `StorageError`."""
     try:
         if not path.is_file():
             raise StorageError(f"{path} is not a file; check the path")
         _check_size(path)
         with safetensors.safe_open(path, framework="numpy") as file:
-            header = _header(file.metadata(), kind)
-            names = list(file.keys())
-            for name in names:
-                if name not in ARRAYS[kind]:
-                    raise StorageError(f"a {kind} has no array {name!r:.60}")
-                if file.get_slice(name).get_dtype() != "F64":
-                    raise StorageError(f"array {name!r} is not of 64-bit floats")
-            promised = header.get("arrays")
-            if not isinstance(promised, list):
-                raise StorageError("its header does not name its arrays")
-            missing = [n for n in promised if n not in names]
-            if missing:
-                raise StorageError(f"array {missing[0]!r:.60} is missing")
-            if len(promised) != len(names):
-                raise StorageError("it holds arrays that its header does not name")
-            tensors = {n: np.asarray(file.get_tensor(n)) for n in names}
+            yield file
     except StorageError as error:
         raise StorageError(f"cannot read {path} as a kreps {kind}: {error}") from error
     except (
@@ -148,12 +183,6 @@ def read_arrays(path: Path, kind: str) -> tuple[Tensors, Header]:
             f"cannot read {path} as a kreps {kind}: {error}; "
             "the file is damaged or comes from another program"
         ) from error
-    for name, values in tensors.items():
-        if not is_sane(values).all():
-            raise StorageError(
-                f"{path} holds NaN, infinities or absurdly large numbers in {name!r}: it is damaged"
-            )
-    return tensors, header
 
 
 def _check_size(path: Path) -> None:
@@ -267,6 +296,33 @@ def _process_of(
         )
 
 
+def _sparse_parts(policy: SparseGP) -> Tensors:
+    return {
+        "policy.mean_weights": policy.mean_weights,
+        "policy.explained": policy.explained,
+        "policy.signal_and_noise": np.array([policy.signal, policy.noise]),
+    }
+
+
+def _sparse_of(tensors: Tensors, task: TaskSpec, kernel: Kernel, states: FloatArray) -> SparseGP:
+    t = _take(
+        tensors,
+        {
+            "policy.mean_weights": ("m", "da"),
+            "policy.explained": ("m", "m"),
+            "policy.signal_and_noise": (2,),
+        },
+        m=len(states),
+        da=task.action_size,
+    )
+    signal, noise = t["policy.signal_and_noise"].tolist()
+    if not (signal > 0 and noise > 0):
+        raise StorageError("the policy has variances <= 0")
+    return SparseGP(
+        task, kernel, states, t["policy.mean_weights"], t["policy.explained"], signal, noise
+    )
+
+
 def _softmax_parts(policy: SoftmaxPolicy) -> Tensors:
     return {
         "policy.table": policy.table,
@@ -342,16 +398,17 @@ def _lipschitz_of(
 
 _POLICIES: dict[str, tuple[type[Any], Callable[[Any], Tensors], Callable[..., LearntPolicy]]] = {
     "cost-sensitive-gp": (CostSensitiveGP, _process_parts, _process_of),
+    "sparse-gp": (SparseGP, _sparse_parts, _sparse_of),
     "softmax": (SoftmaxPolicy, _softmax_parts, _softmax_of),
     "lipschitz": (LipschitzPolicy, _lipschitz_parts, _lipschitz_of),
 }
 """By name in files: the class, what to write of it beside kernel and states, how to read it."""
 
-POLICY_OF_METHOD = {
-    "reps": "cost-sensitive-gp",
-    "value-iteration": "softmax",
-    "grid-value-iteration": "softmax",
-    "npalp": "lipschitz",
+POLICIES_OF_METHOD = {
+    "reps": {"cost-sensitive-gp", "sparse-gp"},
+    "value-iteration": {"softmax"},
+    "grid-value-iteration": {"softmax"},
+    "npalp": {"lipschitz"},
 }
 """What each method learns; the first has V in an RKHS beside it."""
 
@@ -386,31 +443,36 @@ def _policy_of(tensors: Tensors, task: TaskSpec, kind: str) -> LearntPolicy:
     return read(tensors, task, _state_kernel(task, t["policy.lengthscales"]), states)
 
 
-def _value_parts(value: ValueFunction) -> Tensors:
-    return {
-        "value.lengthscales": value.kernel.lengthscales,
-        "value.centres": value.centres,
-        "value.alpha": value.alpha,
-    }
+def _value_parts(value: LinearFunction) -> Tensors:
+    common = {"value.lengthscales": value.kernel.lengthscales}
+    if isinstance(value, FourierExpansion):
+        return common | {"value.frequencies": value.frequencies, "value.theta": value.theta}
+    assert isinstance(value, KernelExpansion)
+    return common | {"value.centres": value.centres, "value.alpha": value.alpha}
 
 
-def _value_of(tensors: Tensors, task: TaskSpec) -> ValueFunction:
+def _value_of(tensors: Tensors, task: TaskSpec) -> LinearFunction:
+    fourier = "value.frequencies" in tensors
+    shapes: dict[str, tuple[str | int, ...]] = (
+        {"value.frequencies": ("half", "coordinates"), "value.theta": ("r",)}
+        if fourier
+        else {"value.centres": ("r", "ds"), "value.alpha": ("r",)}
+    )
     t = _take(
         tensors,
-        {
-            "value.lengthscales": ("factors",),
-            "value.centres": ("r", "ds"),
-            "value.alpha": ("r",),
-        },
+        {"value.lengthscales": ("factors",), **shapes},
         factors=task.factor_count,
         ds=task.observation_size,
     )
     kernel = _state_kernel(task, t["value.lengthscales"])
-    return ValueFunction(kernel, t["value.centres"], t["value.alpha"])
+    if not fourier:
+        return KernelExpansion(kernel, t["value.centres"], t["value.alpha"])
+    value = FourierExpansion(kernel, t["value.frequencies"], t["value.theta"])
+    value(np.zeros((1, task.observation_size)))  # sizes that do not fit are refused here
+    return value
 
 
-def _window_parts(window: Window) -> Tensors:
-    rollouts = window.rollouts
+def _rollout_parts(rollouts: Sequence[Rollout]) -> Tensors:
     return {
         "window.lengths": np.array([len(r) for r in rollouts], dtype=np.float64),
         "window.terminated": np.array([r.terminated for r in rollouts], dtype=np.float64),
@@ -420,18 +482,16 @@ def _window_parts(window: Window) -> Tensors:
     }
 
 
-def _window_of(tensors: Tensors, task: TaskSpec, capacity: int) -> Window:
+def _rollouts_of(tensors: Tensors, ds: str | int, da: str | int) -> list[Rollout]:
     t = _take(
         tensors,
         {
             "window.lengths": ("R",),
             "window.terminated": ("R",),
-            "window.observations": ("points", "ds"),
-            "window.actions": ("n", "da"),
+            "window.observations": ("points", ds),
+            "window.actions": ("n", da),
             "window.rewards": ("n",),
         },
-        ds=task.observation_size,
-        da=task.action_size,
     )
     lengths, n = t["window.lengths"], len(t["window.rewards"])
     whole = (lengths >= 1).all() and (lengths <= n).all() and (lengths % 1 == 0).all()
@@ -441,11 +501,88 @@ def _window_of(tensors: Tensors, task: TaskSpec, capacity: int) -> Window:
     observations = np.split(t["window.observations"], cuts + np.arange(1, len(lengths)))
     actions = np.split(t["window.actions"], cuts)
     rewards = np.split(t["window.rewards"], cuts)
-    rollouts = [
+    return [
         Rollout(o, a, r, bool(end))
         for o, a, r, end in zip(observations, actions, rewards, t["window.terminated"], strict=True)
     ]
-    return Window(capacity).extend(rollouts)
+
+
+# ---- roll-outs --------------------------------------------------------------------------------
+
+
+def save_rollouts(rollouts: Sequence[Rollout], path: str | Path) -> None:
+    """Write at least one roll-out to a file; read it back with `load_rollouts`.
+
+    Raises:
+        DataError: no roll-out, or of different widths.
+        StorageError: the file cannot be written.
+    """
+    if not rollouts:
+        raise DataError("there is no roll-out to write; give at least one")
+    widths = {(r.observations.shape[1], r.actions.shape[1]) for r in rollouts}
+    if len(widths) > 1:
+        raise DataError(
+            f"roll-outs of (observation, action) coordinates {sorted(widths)} do not belong in one "
+            "file; write those of each task to its own"
+        )
+    samples = sum(len(r) for r in rollouts)
+    write_arrays(Path(path), "rollouts", _rollout_parts(rollouts), {"samples": samples})
+
+
+def load_rollouts(path: str | Path) -> list[Rollout]:
+    """Roll-outs written by `save_rollouts`.
+
+    Raises:
+        StorageError: the file is missing, damaged or foreign.
+    """
+    tensors, _ = read_arrays(Path(path), "rollouts")
+    try:
+        return _rollouts_of(tensors, "ds", "da")
+    except KrepsError as error:
+        raise _inconsistent(path, "file of roll-outs", error) from error
+
+
+@dataclass(frozen=True)
+class RolloutFile:
+    """A file of roll-outs as a chunk of a data set: read when it is needed, by whoever needs it."""
+
+    path: Path
+    samples: int
+
+    def __len__(self) -> int:
+        return self.samples
+
+    def load(self) -> Transitions:
+        data = Transitions.of(load_rollouts(self.path))
+        if len(data) != self.samples:
+            raise StorageError(
+                f"{self.path} holds {len(data)} samples, but had {self.samples} when the folder "
+                "was opened; open it again"
+            )
+        return data
+
+
+def rollout_folder(path: str | Path) -> Dataset:
+    """The files of roll-outs (``*.safetensors``) in a folder, in the order of their names.
+
+    Raises:
+        StorageError: no such folder, or a file in it that is damaged or foreign.
+    """
+    folder = Path(path)
+    if not folder.is_dir():
+        raise StorageError(f"{folder} is not a folder; check the path")
+    files = sorted(folder.glob("*.safetensors"))
+    if not files:
+        raise StorageError(
+            f"{folder} holds no *.safetensors; write roll-outs there with kreps.save_rollouts"
+        )
+    chunks = []
+    for file in files:
+        samples = read_header(file, "rollouts").get("samples")
+        if type(samples) is not int or samples < 1:
+            raise StorageError(f"{file} does not say how many samples it holds: it is damaged")
+        chunks.append(RolloutFile(file, samples))
+    return Dataset(tuple(chunks))
 
 
 # ---- policies and checkpoints -----------------------------------------------------------------
@@ -488,7 +625,7 @@ def save_checkpoint(
         "steps": state.steps,
     }
     if state.window.rollouts:
-        tensors |= _window_parts(state.window)
+        tensors |= _rollout_parts(state.window.rollouts)
     if state.policy is not None:
         parts, header["policy"] = _policy_parts(state.policy)
         tensors |= parts
@@ -521,17 +658,18 @@ def load_checkpoint(
         counts = [header[name] for name in ("seed", "iteration", "rollouts", "steps")]
         if not all(type(count) is int and count >= 0 for count in counts):
             raise StorageError(f"seed and counts {counts} are not all whole numbers >= 0")
-        seed, iteration, rollouts, steps = counts
+        seed, iteration, rollouts_seen, steps = counts
         window = Window(settings.window)
         if iteration > 0 or "window.lengths" in tensors:
-            window = _window_of(tensors, task, settings.window)
+            rollouts = _rollouts_of(tensors, task.observation_size, task.action_size)
+            window = window.extend(rollouts)
         learnt, g = iteration > 0, task.factor_count
-        if learnt and header["policy"] != POLICY_OF_METHOD[method]:
+        if learnt and header["policy"] not in POLICIES_OF_METHOD[method]:
             raise StorageError(f"it holds a policy that {method} does not learn")
         state = LearnerState(
             window=window,
             iteration=iteration,
-            rollouts=rollouts,
+            rollouts=rollouts_seen,
             steps=steps,
             policy=_policy_of(tensors, task, header["policy"]) if learnt else None,
             value=_value_of(tensors, task) if learnt and method == "reps" else None,

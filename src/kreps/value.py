@@ -6,50 +6,65 @@ With features ``phi`` the value function is ``V(s) = phi(s)' theta`` and its squ
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from kreps.arrays import FloatArray
+from kreps.arrays import Array, FloatArray, like, namespace
 from kreps.errors import ConfigurationError
 from kreps.kernels import Factor, Kernel, Periodic
-from kreps.linalg import pivoted_cholesky, solve_lower, solve_lower_transposed
+from kreps.linalg import cholesky, pivoted_cholesky, solve_lower, solve_lower_transposed
 
 MAX_CENTRES = 4096
 """Most centres of a grid: the dual costs their cube."""
 
 
 class Basis(Protocol):
-    """Features of the value function."""
+    """Features of the value function, or of anything else that is a function of its inputs."""
 
     @property
     def residual(self) -> float:
         """Largest squared residual of a sampled state's kernel function; 0 for fixed features."""
         ...
 
-    def value_function(self, theta: FloatArray) -> ValueFunction:
-        """``V(s) = phi(s)' theta`` as a kernel expansion, for ``theta`` of shape (r,)."""
+    def features(self, states: Array) -> Array:
+        """``phi``, (m, r), at states (m, ds)."""
+        ...
+
+    def function(self, theta: FloatArray) -> LinearFunction:
+        """``phi(s)' theta``, for ``theta`` of shape (r,) or (r, k)."""
+        ...
+
+
+class LinearFunction(Protocol):
+    """A function that is linear in features: V, in units of the reward, or a part of mu."""
+
+    @property
+    def kernel(self) -> Kernel: ...
+
+    def __call__(self, states: Array) -> Array:
+        """Its values (m,) or (m, k) at states (m, ds)."""
         ...
 
 
 @dataclass(frozen=True)
-class ValueFunction:
+class KernelExpansion:
     """``V(s) = sum_j alpha_j k_s(s~_j, s)`` (Eq. 3), in units of the reward.
 
     Attributes:
         kernel: over states.
         centres: (r, ds) the s~_j.
-        alpha: (r,).
+        alpha: (r,); or (r, k) for k functions at once.
     """
 
     kernel: Kernel
     centres: FloatArray
     alpha: FloatArray
 
-    def __call__(self, states: FloatArray) -> FloatArray:
-        """V (m,) at states (m, ds)."""
-        return self.kernel.gram(self.centres, states).T @ self.alpha
+    def __call__(self, states: Array) -> Array:
+        k = self.kernel.gram(like(self.centres, states), states)
+        return k.T @ like(self.alpha, states)
 
 
 @dataclass(frozen=True)
@@ -81,12 +96,76 @@ class RKHSBasis:
         basis = cls(kernel, points[chosen.pivots], lower, chosen.residual)
         return basis, chosen.columns
 
-    def features(self, states: FloatArray) -> FloatArray:
-        """``phi``, (m, r), at states (m, ds)."""
-        return solve_lower(self.lower, self.kernel.gram(self.pivots, states)).T
+    @classmethod
+    def uniform(
+        cls, kernel: Kernel, points: FloatArray, *, max_rank: int, rng: np.random.Generator
+    ) -> RKHSBasis:
+        """The same with pivots drawn at random among the ``points`` (m, ds): Nystroem's way."""
+        rows = np.sort(rng.choice(len(points), min(max_rank, len(points)), replace=False))
+        basis = cls(kernel, points[rows], cholesky(kernel.gram(points[rows])).lower, 0.0)
+        features = basis.features(points)
+        left = 1.0 - np.einsum("ij,ij->i", features, features)
+        return replace(basis, residual=max(float(left.max()), 0.0))
 
-    def value_function(self, theta: FloatArray) -> ValueFunction:
-        return ValueFunction(self.kernel, self.pivots, solve_lower_transposed(self.lower, theta))
+    def features(self, states: Array) -> Array:
+        k = self.kernel.gram(like(self.pivots, states), states)
+        return solve_lower(like(self.lower, states), k).T
+
+    def function(self, theta: FloatArray) -> LinearFunction:
+        return KernelExpansion(self.kernel, self.pivots, solve_lower_transposed(self.lower, theta))
+
+
+@dataclass(frozen=True)
+class FourierBasis:
+    """Random Fourier features of the embedded coordinates (Rahimi and Recht 2007).
+
+    ``phi(s) = (cos W e(s), sin W e(s)) / sqrt(r / 2)`` with standard normal W: inner products are
+    unbiased estimates of the kernel, with an error of order ``sqrt(2 / r)``.
+
+    Attributes:
+        kernel: over states; its embedding is e.
+        frequencies: (r / 2, m) the W.
+    """
+
+    kernel: Kernel
+    frequencies: FloatArray
+    residual: float = 0.0
+
+    @classmethod
+    def draw(
+        cls, kernel: Kernel, dimension: int, *, max_rank: int, rng: np.random.Generator
+    ) -> FourierBasis:
+        """At most ``max_rank`` features (but two at least) of inputs (m, dimension)."""
+        coordinates = kernel.embed(np.zeros((1, dimension))).shape[1]
+        return cls(kernel, rng.standard_normal((max(1, max_rank // 2), coordinates)))
+
+    def features(self, states: Array) -> Array:
+        xp = namespace(states)
+        phases = self.kernel.embed(states) @ like(self.frequencies, states).T
+        both = xp.concat([xp.cos(phases), xp.sin(phases)], axis=1)
+        return both / len(self.frequencies) ** 0.5
+
+    def function(self, theta: FloatArray) -> LinearFunction:
+        return FourierExpansion(self.kernel, self.frequencies, theta)
+
+
+@dataclass(frozen=True)
+class FourierExpansion:
+    """``V(s) = phi(s)' theta`` in random Fourier features.
+
+    Attributes:
+        kernel: over states.
+        frequencies: (r / 2, m).
+        theta: (r,), in units of the reward; or (r, k) for k functions at once.
+    """
+
+    kernel: Kernel
+    frequencies: FloatArray
+    theta: FloatArray
+
+    def __call__(self, states: Array) -> Array:
+        phi = FourierBasis(self.kernel, self.frequencies).features(states)
+        return phi @ like(self.theta, states)
 
 
 @dataclass(frozen=True)
@@ -128,9 +207,8 @@ class RBFGrid:
         grid = cls(Kernel(factors, np.array(lengthscales)), centres)
         return grid, grid.features(points)
 
-    def features(self, states: FloatArray) -> FloatArray:
-        """``phi``, (m, r), at states (m, ds)."""
-        return self.kernel.gram(self.centres, states).T
+    def features(self, states: Array) -> Array:
+        return self.kernel.gram(like(self.centres, states), states).T
 
-    def value_function(self, theta: FloatArray) -> ValueFunction:
-        return ValueFunction(self.kernel, self.centres, theta)
+    def function(self, theta: FloatArray) -> LinearFunction:
+        return KernelExpansion(self.kernel, self.centres, theta)

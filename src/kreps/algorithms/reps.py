@@ -151,7 +151,7 @@ def update(
         rollouts,
         window,
         policy=policy,
-        value=basis.value_function(reward_unit * dual.theta),
+        value=basis.function(reward_unit * dual.theta),
         embedding_start=embedding_start,
         policy_start=policy_x,
     )
@@ -231,17 +231,20 @@ class PolicySamples:
         states: (m, ds).
         targets: (m, da) commanded actions around their centre, in units of the action scale.
         weights: (m,) ``p_i / sum p^2``: over all samples they add up to the effective sample size.
+        evidence: sum of the weights, those of samples that are not among these included.
     """
 
     states: FloatArray
     targets: FloatArray
     weights: FloatArray
+    evidence: float
 
     @classmethod
     def of(cls, data: Transitions, p: FloatArray, task: TaskSpec) -> PolicySamples:
         kept = len(p) * p >= DROPPED_WEIGHT
         targets = task.scaled(data.actions[kept])
-        return cls(data.states[kept], targets, p[kept] * effective_sample_size(p))
+        weights = p[kept] * effective_sample_size(p)
+        return cls(data.states[kept], targets, weights, float(weights.sum()))
 
 
 def policy_hyperparameters(
@@ -251,7 +254,15 @@ def policy_hyperparameters(
     start: FloatArray | None,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Log lengthscales (g,), log sf2 and log l of the policy, by weighted leave-one-out density."""
+    """Log lengthscales (g,), log sf2 and log l of the policy, by weighted leave-one-out density.
+
+    Args:
+        samples: those that the policy is fitted to, or some of them.
+        state_kernel: its factors are those of the policy's kernel, with other lengthscales.
+        settings: priors or hard ranges.
+        start: log hyper-parameters (g + 2,) to start the fit from; None for the priors' centre.
+        rng: chooses the samples of the fit.
+    """
     median = np.log(state_kernel.lengthscales)
     g = len(median)
     share = samples.weights / samples.weights.sum()
@@ -265,7 +276,7 @@ def policy_hyperparameters(
             spread=np.concatenate([np.full(g, 0.7), [1.0, 1.0]]),
             low=np.concatenate([median - 4.0, np.log([1e-4, 1e-4])]),
             high=np.concatenate([median + 3.0, np.log([1e2, 1e2])]),
-            strength=1.0 / float(samples.weights.sum()),
+            strength=1.0 / samples.evidence,
         )
     else:
         prior = Prior(

@@ -11,7 +11,7 @@ from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window
 from kreps.errors import ConfigurationError, DataError
 from kreps.policies import MAX_SUPPORT, LearntPolicy
-from kreps.value import ValueFunction
+from kreps.value import LinearFunction
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class LearnerState:
     rollouts: int = 0
     steps: int = 0
     policy: LearntPolicy | None = None
-    value: ValueFunction | None = None
+    value: LinearFunction | None = None
     embedding_start: FloatArray | None = None
     policy_start: FloatArray | None = None
 
@@ -44,19 +44,28 @@ class LearnerState:
             DataError: no roll-outs at all, or some of another width than the task's.
             ConfigurationError: more samples than an exact update can serve.
         """
-        for rollout in rollouts:
-            rollout.check(task)
-        window = self.window.extend(rollouts)
-        if not window.rollouts:
-            raise DataError("there is no roll-out to learn from; give at least one")
+        window = self.extended_window(rollouts, task)
         data = window.transitions
         if len(data) > MAX_SUPPORT:
             raise ConfigurationError(
                 f"{len(data)} samples are kept, but the exact update takes at most {MAX_SUPPORT}, "
                 f"as it costs their cube; keep fewer than {len(window.rollouts)} roll-outs: lower "
-                "window"
+                'window (or let KREPS approximate: approximation="auto")'
             )
         return window, data
+
+    def extended_window(self, rollouts: Sequence[Rollout], task: TaskSpec) -> Window:
+        """The window with new roll-outs.
+
+        Raises:
+            DataError: no roll-outs at all, or some of another width than the task's.
+        """
+        for rollout in rollouts:
+            rollout.check(task)
+        window = self.window.extend(rollouts)
+        if not window.rollouts:
+            raise DataError("there is no roll-out to learn from; give at least one")
+        return window
 
     def after(self, rollouts: Sequence[Rollout], window: Window, **learnt: Any) -> LearnerState:
         """The state after an update from new ``rollouts``, with what was ``learnt`` replaced."""

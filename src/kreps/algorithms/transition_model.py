@@ -39,25 +39,29 @@ def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
     return successors
 
 
-def fit_embedding(
-    data: Transitions,
-    successors: FloatArray,
+def state_actions(data: Transitions, task: TaskSpec) -> FloatArray:
+    """States and applied actions side by side, (n, ds + da), actions in units of their scale."""
+    return np.concatenate([data.states, task.scaled(task.clip(data.actions))], axis=1)
+
+
+def embedding_hyperparameters(
+    inputs: FloatArray,
+    targets: FloatArray,
     state_kernel: Kernel,
     task: TaskSpec,
     start: FloatArray | None,
     rng: np.random.Generator,
-) -> tuple[KernelEmbedding, FloatArray]:
-    """The embedding (Eq. 4) on states and applied actions, and its log hyper-parameters.
+) -> tuple[Kernel, float, FloatArray]:
+    """Kernel and regulariser of the embedding by leave-one-out error (Eq. 4), and their logs.
 
     Args:
-        data: n transitions.
-        successors: (n, r) features of the observed successors: what is to be predicted.
+        inputs: (n, ds + da) states and applied actions.
+        targets: (n, r) features of the observed successors: what is to be predicted.
         state_kernel: its factors are those of the embedding's kernel, with other lengthscales.
-        task: limits and scale of the actions.
+        task: number of action coordinates.
         start: log hyper-parameters (g + da + 1,) to start the fit from; None for the median.
         rng: chooses the samples of the fit.
     """
-    inputs = np.concatenate([data.states, task.scaled(task.clip(data.actions))], axis=1)
     action_factors = tuple(
         SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
     )
@@ -71,6 +75,25 @@ def fit_embedding(
         high=np.append(median + 3.0, 0.0),
         strength=0.0,
     )
-    loss = EmbeddingLoss(factor_distances(factors, inputs[sample]), successors[sample])
+    loss = EmbeddingLoss(factor_distances(factors, inputs[sample]), targets[sample])
     x = minimise(loss, prior, np.append(median, np.log(1e-3)) if start is None else start)
-    return KernelEmbedding.fit(Kernel(factors, np.exp(x[:-1])), inputs, float(np.exp(x[-1]))), x
+    return Kernel(factors, np.exp(x[:-1])), float(np.exp(x[-1])), x
+
+
+def fit_embedding(
+    data: Transitions,
+    successors: FloatArray,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+) -> tuple[KernelEmbedding, FloatArray]:
+    """The embedding (Eq. 4) of n transitions on states and applied actions, and its log parameters.
+
+    Arguments are those of `embedding_hyperparameters`, with (n, r) ``successors`` as targets.
+    """
+    inputs = state_actions(data, task)
+    kernel, regulariser, x = embedding_hyperparameters(
+        inputs, successors, state_kernel, task, start, rng
+    )
+    return KernelEmbedding.fit(kernel, inputs, regulariser), x

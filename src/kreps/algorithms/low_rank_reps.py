@@ -1,0 +1,221 @@
+"""Algorithm 1 on any number of samples: the steps of `kreps.algorithms.reps`, in low rank.
+
+Three things take the place of exact ones: bases are chosen from a sample of the data, the embedding
+(Eq. 4) is a regression of features on features, and the policy is a Gaussian process on inducing
+points.  Every sum over samples is taken chunk by chunk: cost grows linearly with their number, and
+memory hardly at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import reduce
+from operator import add
+
+import numpy as np
+
+from kreps.algorithms.chunk_sums import (
+    BellmanRows,
+    ChunkPolicySums,
+    ChunkRewards,
+    EmbeddingSums,
+    FeatureChanges,
+    StartFeatures,
+    StreamedProblem,
+)
+from kreps.algorithms.reps import (
+    DROPPED_WEIGHT,
+    ETA_LEAST,
+    PolicySamples,
+    UpdateInfo,
+    policy_hyperparameters,
+)
+from kreps.algorithms.state import LearnerState, Stopwatch
+from kreps.algorithms.transition_model import (
+    embedding_hyperparameters,
+    state_actions,
+    state_kernel,
+)
+from kreps.arrays import FloatArray, IntArray, as_float
+from kreps.compute import Compute
+from kreps.data import Rollout, TaskSpec, Transitions
+from kreps.dataset import Dataset
+from kreps.dual import DualProblem, DualSolution, effective_sample_size, solve_dual, standardise
+from kreps.embedding import FeatureRegression
+from kreps.kernels import Kernel
+from kreps.settings import Settings
+from kreps.sparse_gp import SparseGP
+from kreps.value import Basis, FourierBasis, RBFGrid, RKHSBasis
+
+EXACT_LIMIT = 3_000
+"""Samples up to which ``approximation="auto"`` is exact."""
+
+SAMPLE = 10_000
+"""Samples among which bases are chosen and hyper-parameters fitted, where there are more."""
+
+
+def applies(settings: Settings, samples: int) -> bool:
+    """Whether an update from so many samples is of low rank."""
+    if settings.approximation == "auto":
+        return samples > EXACT_LIMIT
+    return settings.approximation != "exact"
+
+
+def update(
+    state: LearnerState,
+    rollouts: Sequence[Rollout] | Dataset,
+    task: TaskSpec,
+    settings: Settings,
+    rng: np.random.Generator,
+    compute: Compute,
+) -> tuple[LearnerState, UpdateInfo]:
+    """One iteration of Algorithm 1 from new roll-outs and those kept, or from a data set alone.
+
+    Raises:
+        DataError: no roll-outs at all, or some of another width than the task's.
+    """
+    if isinstance(rollouts, Dataset):
+        window, dataset = state.window, rollouts
+    else:
+        window = state.extended_window(rollouts, task)
+        dataset = Dataset.of(window.rollouts)
+    clock = Stopwatch()
+    n = len(dataset)
+    raw = np.concatenate(list(compute.map(ChunkRewards(task), dataset.chunks)))
+    rewards, reward_unit = standardise(raw)
+    sampled = some(np.arange(n), rng)
+    sample = dataset.take(sampled)
+    clock.lap("sample")
+
+    # Eq. 3: a basis of V, chosen among the sampled states
+    kernel = state_kernel(sample, task, rng)
+    if settings.features == "grid":
+        basis: Basis = RBFGrid.over(kernel.factors, sample.points, settings.grid_size)[0]
+    else:
+        basis = choose_basis(kernel, sample.points, settings, settings.max_rank, rng)
+    place = compute.to_device
+    *starts, count = reduce(add, compute.map(StartFeatures(basis, place), dataset.chunks))
+    changes = FeatureChanges(basis, np.array(starts) / count, place)
+    clock.lap("basis")
+
+    # Eq. 4: the expected features of each successor, linear in features of state and action
+    from_own = settings.model == "change"
+    model, embedding_start = None, None
+    if settings.model != "sample":
+        inputs = state_actions(sample, task)
+        own, after = replace(changes, place=as_float).both(sample)
+        targets = after - own if from_own else after
+        joint_kernel, regulariser, embedding_start = embedding_hyperparameters(
+            inputs, targets, kernel, task, state.embedding_start, rng
+        )
+        clock.lap("embedding fit")
+        embedded = choose_basis(joint_kernel, inputs, settings, settings.rank, rng)
+        says = EmbeddingSums(changes, embedded, task, from_own)
+        sums = reduce(add, compute.map(says, dataset.chunks))
+        model = FeatureRegression.fit(embedded, sums, regulariser)
+    clock.lap("embedding")
+
+    # Eqs. 2 and 5: minimise the dual
+    problem = StreamedProblem(
+        dataset=dataset,
+        rows=BellmanRows(changes, model, task, from_own, settings.restart_probability),
+        rewards=rewards,
+        kl_bound=settings.kl_bound,
+        ridge=settings.ridge / n,
+        eta_floor=max(settings.eta_floor, ETA_LEAST),
+        compute=compute,
+    )
+    dual = solve(problem, sample, sampled)
+    clock.lap("dual")
+
+    # Sec. 2: generalise the weighted samples to a stochastic policy
+    weights = np.where(n * dual.weights >= DROPPED_WEIGHT, dual.weights, 0.0)
+    weights *= effective_sample_size(dual.weights)
+    heard = some(np.flatnonzero(weights), rng)
+    among = dataset.take(heard)
+    support = PolicySamples(
+        among.states, task.scaled(among.actions), weights[heard], float(weights.sum())
+    )
+    x = policy_hyperparameters(support, kernel, settings, state.policy_start, rng)
+    clock.lap("policy fit")
+    policy_kernel = kernel.with_lengthscales(np.exp(x[:-2]))
+    centres = choose_centres(policy_kernel, support.states, settings.rank, settings, rng)
+    says_of_policy = ChunkPolicySums(centres, task, place)
+    said = reduce(add, compute.map(says_of_policy, dataset.chunks, dataset.split(weights)))
+    policy = SparseGP.fit(
+        task, centres, said, signal=float(np.exp(x[-2])), noise=float(np.exp(x[-1]))
+    )
+    clock.lap("policy")
+
+    new_state = replace(
+        state,
+        window=window,
+        iteration=state.iteration + 1,
+        rollouts=state.rollouts + (int(count) if isinstance(rollouts, Dataset) else len(rollouts)),
+        steps=state.steps + (n if isinstance(rollouts, Dataset) else sum(map(len, rollouts))),
+        policy=policy,
+        value=basis.function(reward_unit * dual.theta),
+        embedding_start=embedding_start,
+        policy_start=x,
+    )
+    info = UpdateInfo(
+        samples=n,
+        kl_bound=settings.kl_bound,
+        rank=problem.rank,
+        rank_residual=basis.residual,
+        dual=dual,
+        effective_samples=effective_sample_size(dual.weights),
+        support=len(policy.states),
+        state_lengthscales=kernel.lengthscales,
+        embedding_parameters=None if embedding_start is None else np.exp(embedding_start),
+        policy_parameters=np.exp(x),
+        jitter=max(dual.jitter, 0.0 if model is None else model.jitter),
+        seconds=clock.seconds,
+    )
+    return new_state, info
+
+
+def some(numbers: IntArray, rng: np.random.Generator) -> IntArray:
+    """At most `SAMPLE` of the numbers, in order."""
+    if len(numbers) <= SAMPLE:
+        return numbers
+    return np.sort(rng.choice(numbers, SAMPLE, replace=False))
+
+
+def choose_basis(
+    kernel: Kernel, points: FloatArray, settings: Settings, rank: int, rng: np.random.Generator
+) -> Basis:
+    """At most ``rank`` features of a kernel over points (m, d), as ``approximation`` asks for."""
+    if settings.approximation == "fourier":
+        return FourierBasis.draw(kernel, points.shape[1], max_rank=rank, rng=rng)
+    return choose_centres(kernel, points, rank, settings, rng)
+
+
+def choose_centres(
+    kernel: Kernel, points: FloatArray, rank: int, settings: Settings, rng: np.random.Generator
+) -> RKHSBasis:
+    """The same with features that belong to some of the points.
+
+    The policy asks for these in any case: random Fourier features repeat themselves, so that a
+    process made of them is sure of itself where it has never been.
+    """
+    if settings.approximation == "uniform":
+        return RKHSBasis.uniform(kernel, points, max_rank=rank, rng=rng)
+    return RKHSBasis.fit(kernel, points, tolerance=settings.basis_tolerance, max_rank=rank)[0]
+
+
+def solve(problem: StreamedProblem, sample: Transitions, sampled: IntArray) -> DualSolution:
+    """The dual on the sample, in memory; and from there on all samples, if there are more."""
+    rows = problem.rows
+    near = DualProblem(
+        rewards=problem.rewards[sampled],
+        differences=replace(rows, changes=replace(rows.changes, place=as_float))(sample),
+        kl_bound=problem.kl_bound,
+        ridge=problem.ridge,
+        eta_floor=problem.eta_floor,
+    )
+    dual = solve_dual(near)
+    if len(sampled) == len(problem.rewards):
+        return dual
+    return solve_dual(problem, start=(dual.eta, dual.theta))

@@ -1,0 +1,179 @@
+"""Any number of transitions, in chunks that need not be in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from kreps.arrays import BoolArray, FloatArray, IntArray
+from kreps.data import Rollout, Transitions, is_sane
+from kreps.errors import DataError
+
+CHUNK = 8192
+"""Samples per chunk, about: 64 MB for each 1000 features."""
+
+
+class Chunk(Protocol):
+    """Some whole roll-outs, to be read when they are needed, perhaps by another process."""
+
+    def __len__(self) -> int:
+        """Number of samples."""
+        ...
+
+    def load(self) -> Transitions:
+        """The transitions."""
+        ...
+
+
+@dataclass(frozen=True)
+class RolloutChunk:
+    """Roll-outs in memory."""
+
+    rollouts: tuple[Rollout, ...]
+
+    def __len__(self) -> int:
+        return sum(len(rollout) for rollout in self.rollouts)
+
+    def load(self) -> Transitions:
+        return Transitions.of(self.rollouts)
+
+
+@dataclass(frozen=True)
+class ArrayChunk:
+    """Roll-outs laid end to end in arrays, which may be memory-mapped."""
+
+    observations: FloatArray
+    actions: FloatArray
+    rewards: FloatArray
+    lengths: IntArray
+    terminated: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.rewards)
+
+    def load(self) -> Transitions:
+        ends = np.cumsum(self.lengths)
+        state = np.arange(len(self.rewards)) + np.repeat(np.arange(len(ends)), self.lengths)
+        terminated = np.zeros(len(state), dtype=bool)
+        terminated[ends - 1] = self.terminated
+        values = [
+            np.array(each, dtype=np.float64)  # off the disk, once
+            for each in (self.observations, self.actions, self.rewards)
+        ]
+        for name, each in zip(("observations", "actions", "rewards"), values, strict=True):
+            if not is_sane(each).all():
+                raise DataError(
+                    f"{name} hold NaN, an infinity or an absurdly large number; "
+                    "leave those roll-outs out"
+                )
+        points, actions, rewards = values
+        start = np.concatenate([[0], ends[:-1] + np.arange(1, len(ends))])
+        return Transitions(points, state, state + 1, start, actions, rewards, terminated)
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Chunks of whole roll-outs: in memory, memory-mapped, or a folder of files.
+
+    See `Dataset.of`, `Dataset.from_arrays` and `kreps.rollout_folder`.
+    """
+
+    chunks: tuple[Chunk, ...]
+
+    def __post_init__(self) -> None:
+        if not self.chunks:
+            raise DataError("there is no roll-out to learn from; give at least one")
+
+    @classmethod
+    def of(cls, rollouts: Iterable[Rollout]) -> Dataset:
+        """Roll-outs in memory."""
+        groups: list[list[Rollout]] = []
+        size = CHUNK
+        for rollout in rollouts:
+            if size >= CHUNK:
+                groups.append([])
+                size = 0
+            groups[-1].append(rollout)
+            size += len(rollout)
+        return cls(tuple(RolloutChunk(tuple(group)) for group in groups))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        observations: FloatArray,
+        actions: FloatArray,
+        rewards: FloatArray,
+        lengths: Sequence[int] | IntArray,
+        terminated: Sequence[bool] | BoolArray | None = None,
+    ) -> Dataset:
+        """R roll-outs laid end to end in arrays, such as ``np.load(path, mmap_mode="r")``.
+
+        Args:
+            observations: (n + R, ds), those of each roll-out followed by its last successor.
+            actions: (n, da) as commanded.
+            rewards: (n,).
+            lengths: (R,) steps of each roll-out.
+            terminated: (R,) whether each really ended the task; None if none did.
+
+        Raises:
+            DataError: sizes that do not fit together.
+        """
+        steps = np.asarray(lengths, dtype=np.intp)
+        ended = np.zeros(len(steps), bool) if terminated is None else np.asarray(terminated, bool)
+        n = len(rewards)
+        fits = (
+            (observations.ndim, actions.ndim, rewards.ndim) == (2, 2, 1)
+            and (steps >= 1).all()
+            and steps.sum() == n == len(actions)
+            and len(observations) == n + len(steps)
+            and len(ended) == len(steps)
+        )
+        if not fits:
+            raise DataError(
+                f"observations {observations.shape}, actions {actions.shape}, rewards "
+                f"{rewards.shape} and {len(steps)} lengths that add up to {steps.sum()} do not fit "
+                "together: R roll-outs of n steps in all need (n + R, ds), (n, da), (n,) and (R,)"
+            )
+        ends = np.cumsum(steps)
+        # a new chunk begins with the roll-out in which another CHUNK samples are full
+        cuts = np.flatnonzero(np.diff((ends - steps) // CHUNK, prepend=-1))
+        chunks = []
+        for low, high in zip(cuts, [*cuts[1:], len(steps)], strict=True):
+            a, b = int(ends[low] - steps[low]), int(ends[high - 1])
+            chunks.append(
+                ArrayChunk(
+                    observations[a + low : b + high],
+                    actions[a:b],
+                    rewards[a:b],
+                    steps[low:high],
+                    ended[low:high],
+                )
+            )
+        return cls(tuple(chunks))
+
+    def __len__(self) -> int:
+        """Number of samples n."""
+        return int(self.offsets[-1])
+
+    @cached_property
+    def offsets(self) -> IntArray:
+        """(chunks + 1,) number of samples before each chunk, and n."""
+        return np.cumsum([0, *(len(chunk) for chunk in self.chunks)])
+
+    def split(self, values: FloatArray) -> list[FloatArray]:
+        """The parts of ``values`` (n, ...) that belong to each chunk."""
+        return np.split(values, self.offsets[1:-1])
+
+    def take(self, rows: IntArray) -> Transitions:
+        """The samples of these numbers, which must rise."""
+        parts = []
+        cuts = np.searchsorted(rows, self.offsets)
+        for i, chunk in enumerate(self.chunks):
+            chosen = rows[cuts[i] : cuts[i + 1]] - self.offsets[i]
+            if len(chosen):
+                parts.append(chunk.load().rows(chosen))
+        return Transitions.joined(parts)
