@@ -144,8 +144,10 @@ TITLES = {
     "figure-2b": "Swing-up from images and from joint values (Fig. 2b)",
     "swing-up": "kreps/SwingUp-v0: every seed",
     "defaults": "One configuration, three tasks: every seed",
+    "low-rank": "Exact and of low rank: every seed",
+    "forgetting": "Swing-up with and without a window of 30 roll-outs",
 }
-SEED_BY_SEED = ("swing-up", "defaults")
+SEED_BY_SEED = ("swing-up", "defaults", "low-rank")
 
 
 def write_figure(

@@ -20,7 +20,7 @@ from kreps.errors import CellFailure
 from kreps.evaluation import EPISODES
 from kreps.experiments.cells import Cell, cell_of, read_cell, run_cell, write_cell
 from kreps.experiments.search import tuned_options
-from kreps.experiments.specs import FIGURES, TASKS
+from kreps.experiments.specs import BEYOND, FIGURES, TASKS
 
 
 def figure_cells(figure: str, trials: int, iterations: int | None) -> list[Cell]:
@@ -38,7 +38,7 @@ def figure_cells(figure: str, trials: int, iterations: int | None) -> list[Cell]
             episodes=(TASKS[task].episodes, EPISODES),
         )
         for seed in range(trials)
-        for task, method in FIGURES[figure]
+        for task, method in (FIGURES | BEYOND)[figure]
     ]
 
 

@@ -75,6 +75,12 @@ ANY_STATE = "value iteration on a grid (simulator set to any state)"
 NPALP = "NPALP"
 DEFAULT = "kreps (default)"
 PAPER = "paper-like"
+IMAGES = "kreps (images)"
+LOW_RANK = "low rank"
+UNIFORM = "low rank, uniform"
+FOURIER = "low rank, Fourier"
+LOW_RANK_IMAGES = "kreps (images), low rank"
+REMEMBERING = "nothing forgotten"
 
 METHODS: dict[str, Method] = {
     KERNEL: Method("reps"),
@@ -85,6 +91,14 @@ METHODS: dict[str, Method] = {
     NPALP: Method("npalp"),
     DEFAULT: Method("reps", tuned=False),
     PAPER: Method("reps", {"recipe": "paper"}, tuned=False),
+    IMAGES: Method("reps", {"recipe": "images"}, tuned=False),
+    LOW_RANK: Method("reps", {"approximation": "pivoted", "rank": 400}, tuned=False),
+    UNIFORM: Method("reps", {"approximation": "uniform", "rank": 400}, tuned=False),
+    FOURIER: Method("reps", {"approximation": "fourier", "rank": 400}, tuned=False),
+    LOW_RANK_IMAGES: Method(
+        "reps", {"recipe": "images", "approximation": "pivoted", "rank": 400}, tuned=False
+    ),
+    REMEMBERING: Method("reps", {"window": None}, tuned=False),
 }
 
 Curve = tuple[str, str]
@@ -100,5 +114,14 @@ FIGURES: dict[str, tuple[Curve, ...]] = {
     # one configuration for all tasks, nothing tuned
     "defaults": tuple((task, DEFAULT) for task in TASKS),
 }
+BEYOND: dict[str, tuple[Curve, ...]] = {
+    "low-rank": (
+        *(("swing-up", m) for m in (DEFAULT, LOW_RANK, UNIFORM, FOURIER)),
+        *(("reaching", m) for m in (DEFAULT, LOW_RANK)),
+        *(("images", m) for m in (IMAGES, LOW_RANK_IMAGES)),
+    ),
+    "forgetting": tuple(("swing-up", m) for m in (DEFAULT, REMEMBERING)),
+}
+"""Experiments that are not among the paper's: run by name, not by ``all``."""
 PICTURES = ("figure-2a",)
 """Figures without an experiment: the features of the images."""
