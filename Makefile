@@ -2,8 +2,9 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+LARGEST ?= 10000
 
-.PHONY: demo test check format clean constraints tables
+.PHONY: demo test check bench format clean constraints tables
 
 demo: .venv/installed           ## learn the swing-up; pictures and policy in runs/demo
 	rm -rf runs/demo
@@ -17,6 +18,9 @@ check: .venv/installed          ## formatter, linter, types, floors
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+bench: .venv/installed          ## speed against the machine's own peak, to results/benchmarks.md
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --record=results --largest=$(LARGEST)
 
 format: .venv/installed
 	$(BIN)/ruff format .

@@ -19,7 +19,7 @@ import pytest
 from PIL import Image
 
 import kreps
-from kreps import cli
+from kreps import cli, export
 from kreps.evaluation import Greedy, evaluate
 
 NAME = "kreps/SwingUp-v0"
@@ -118,7 +118,7 @@ COMMANDS = [c.name or c.callback.__name__ for c in cli.app.registered_commands i
 
 
 def test_all_commands_are_there() -> None:
-    assert {"train", "resume", "evaluate", "plot", "video"} <= set(COMMANDS)
+    assert {"train", "resume", "evaluate", "plot", "video", "export"} <= set(COMMANDS)
     code, text = call("--help")
     assert code == 0
     assert all(name in text for name in COMMANDS)
@@ -433,6 +433,129 @@ def test_an_environment_that_cannot_be_drawn_still_gets_its_report(tmp_path: Pat
     assert (run / "learning_curve.png").exists()
     assert not (run / "policy_maps.png").exists()  # three-dimensional states
     assert "pygame is not installed" in refused("video", run)
+
+
+# ---- export -----------------------------------------------------------------------------------
+
+STATES = np.random.default_rng(0).normal(size=(20, 2))
+
+
+def actions_of(model: Path, dtype: str = "float64") -> Any:
+    """What an ONNX model does in `STATES`."""
+    onnxruntime = pytest.importorskip("onnxruntime")
+    session = onnxruntime.InferenceSession(str(model), providers=["CPUExecutionProvider"])
+    return session.run(["action"], {"observation": STATES.astype(dtype)})[0]
+
+
+def greedy_actions(policy: Path) -> Any:
+    return kreps.load_policy(policy).predict(STATES, deterministic=True)[0]
+
+
+def test_export_writes_a_model_of_a_run_or_of_a_policy(run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    policy = run / "policy.safetensors"
+    for source, out in ((run, tmp_path / "a.onnx"), (policy, tmp_path / "b.onnx")):
+        code, text = call("export", source, "--out", out)
+        assert code == 0 and f"wrote {out}" in text and "float64 arithmetic" in text
+        np.testing.assert_allclose(actions_of(out), greedy_actions(policy), atol=1e-6 * 30.0)
+    assert (tmp_path / "a.onnx").read_bytes() == (tmp_path / "b.onnx").read_bytes()
+    assert {path.name for path in run.iterdir()} == RUN_FILES
+
+
+def test_export_compresses_and_narrows(run: Path, tmp_path: Path) -> None:
+    pytest.importorskip("onnx")
+    out, small = tmp_path / "x.onnx", tmp_path / "small.safetensors"
+    code, text = call("export", run, "--centres", "5", "--dtype", "float32", "--out", out)
+    assert code == 0 and "float32 arithmetic" in text and "off by" in text
+    assert call("export", run, "--centres", "5", "--out", small)[0] == 0
+    assert len(kreps.load_policy(small).process.states) == 5  # type: ignore[attr-defined]
+    np.testing.assert_allclose(actions_of(out, "float32"), greedy_actions(small), atol=1e-4 * 30.0)
+    code, text = call("export", small, "--out", tmp_path / "again.onnx")
+    assert code == 0
+    np.testing.assert_allclose(
+        actions_of(tmp_path / "again.onnx"), greedy_actions(small), atol=1e-6 * 30.0
+    )
+
+
+def test_export_says_where_single_precision_is_not_enough(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("onnx")
+    monkeypatch.setattr(export, "SINGLE_PRECISION_TOLERANCE", 0.0)
+    out = tmp_path / "x.onnx"
+    code, text = call("export", run, "--dtype", "float32", "--out", out)
+    assert code == 0 and "float64 arithmetic" in text and "--centres" in text
+    wanted = greedy_actions(run / "policy.safetensors")
+    np.testing.assert_allclose(actions_of(out, "float32"), wanted, atol=1e-4 * 30.0)
+
+
+def test_export_says_what_compression_costs(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.safetensors"
+    text = call("export", run, "--centres", "1", "--out", out)[1]
+    assert "take more centres" in text
+    exact = kreps.load_policy(run / "policy.safetensors")
+    states = exact.process.states  # type: ignore[attr-defined]
+    few = kreps.load_policy(out)
+    off = [p.predict(states, deterministic=True)[0] for p in (exact, few)]
+    rms = np.sqrt(np.mean(((off[0] - off[1]) / 30.0) ** 2))
+    assert f"off by {rms:.2g} of its scale" in text
+    text = call("export", run, "--centres", "5000", "--out", out)[1]
+    assert "off by" in text and "take more centres" not in text
+
+
+def test_export_without_centres_copies_a_policy(run: Path, tmp_path: Path) -> None:
+    assert call("export", run, "--out", tmp_path / "x.safetensors")[0] == 0
+    assert (tmp_path / "x.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--out", "x.tflite"], ".onnx or .safetensors"),
+        (["--out", "x"], ".onnx or .safetensors"),
+        ([], "--out"),
+        (["--out", "x.onnx", "--centres", "0"], "--centres"),
+        (["--out", "x.onnx", "--centres", "few"], "--centres"),
+        (["--out", "x.onnx", "--dtype", "float16"], "float64, float32"),
+        (["--out", "x.onnx", "--dtype", ""], "float64, float32"),
+        (["--out", "x.safetensors", "--dtype", "float32"], "write an .onnx file"),
+        (["--out", "missing/x.onnx"], "cannot write missing/x.onnx"),
+        (["--out", "missing/x.safetensors"], "cannot write missing/x.safetensors"),
+        (["--out", "run/policy.safetensors", "--centres", "5"], "choose another name"),
+        (["--out", "run/../run/policy.safetensors"], "choose another name"),
+    ],
+)
+def test_exports_that_cannot_be_served_are_refused_and_leave_nothing(
+    arguments: list[str], says: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("onnx")
+    before = (run / "policy.safetensors").read_bytes()
+    monkeypatch.chdir(tmp_path)
+    assert says in refused("export", run, *arguments)
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert {path.name for path in run.iterdir()} == RUN_FILES
+    assert (run / "policy.safetensors").read_bytes() == before
+
+
+def test_exports_of_what_holds_no_policy_are_refused(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "x.onnx"
+    assert "not a run folder" in refused("export", tmp_path, "--out", out)
+    assert "check the path" in refused("export", tmp_path / "missing", "--out", out)
+    checkpoint = run / "checkpoint.safetensors"
+    assert "it is a kreps checkpoint" in refused("export", checkpoint, "--out", out)
+    (run / "policy.safetensors").unlink()
+    assert "kreps resume" in refused("export", run, "--out", out)
+    assert not out.exists()
+
+
+def test_a_compressed_policy_is_not_compressed_again(run: Path, tmp_path: Path) -> None:
+    small = tmp_path / "small.safetensors"
+    call("export", run, "--centres", "5", "--out", small)
+    out = tmp_path / "x.safetensors"
+    text = refused("export", small, "--centres", "3", "--out", out)
+    assert "5 centres" in text and "made from" in text
+    assert call("export", small, "--centres", "5", "--out", out)[0] == 0
+    assert out.read_bytes() == small.read_bytes()
 
 
 # ---- folders that are no runs, and damaged ones -----------------------------------------------

@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import gc
+import tracemalloc
+from typing import Any
+
 import numpy as np
 import pytest
 
 from kreps.arrays import FloatArray
+from kreps.controller import Policy, mean_difference
 from kreps.data import TaskSpec
 from kreps.errors import ConfigurationError
 from kreps.kernels import Kernel, factors_of
 from kreps.policies import MAX_SUPPORT, PIVOT_TOLERANCE, BangBang, CostSensitiveGP, Gaussian
+from kreps.sparse_gp import SparseGP
+from kreps.value_policies import LipschitzPolicy, SoftmaxPolicy
 
 TASK = TaskSpec(2, np.array([-1.0, 10.0]), np.array([1.0, 30.0]))
 KERNEL = Kernel(factors_of(2), np.array([0.8, 1.3]))
@@ -170,3 +177,78 @@ def test_gaussian_exploration_has_the_spread_asked_for_in_every_state(spread: fl
     np.testing.assert_allclose(
         actions, [0.0, 20.0] + spread * np.array([1.0, 10.0]) * noise, rtol=1e-12
     )
+
+
+# ---- as their user holds them -----------------------------------------------------------------
+
+
+def test_a_compressed_policy_acts_by_its_process_with_the_same_seed() -> None:
+    process, query = fit(*samples(60, 30)), np.random.default_rng(31).normal(size=(8, 2))
+    few = Policy(process, seed=3).compressed(10)
+    assert isinstance(few.process, SparseGP) and len(few.process.states) == 10
+    wanted = TASK.clip(process.compressed(10).greedy(query))
+    np.testing.assert_array_equal(few.predict(query, deterministic=True)[0], wanted)
+    again = Policy(few.process, seed=3).predict(query)[0]
+    np.testing.assert_array_equal(few.predict(query)[0], again)
+
+
+def test_compressing_leaves_the_policy_as_it_was() -> None:
+    policy, query = Policy(fit(*samples(60, 32))), np.zeros((3, 2))
+    before = policy.predict(query, deterministic=True)[0]
+    policy.compressed(5)
+    np.testing.assert_array_equal(policy.predict(query, deterministic=True)[0], before)
+
+
+def test_a_compressed_policy_is_compressed_already() -> None:
+    few = Policy(fit(*samples(60, 33))).compressed(10)
+    assert few.compressed(10) is few and few.compressed(11) is few
+    with pytest.raises(ConfigurationError, match=r"10 centres before, 9 .*made from"):
+        few.compressed(9)
+
+
+@pytest.mark.parametrize("centres", [0, -3, 2.5, "ten", None, np.array([3, 4])])
+def test_a_number_of_centres_that_is_none_is_refused(centres: Any) -> None:
+    policy = Policy(fit(*samples(20, 34)))
+    for each in (policy, policy.compressed(5)):
+        with pytest.raises(ConfigurationError, match=r"centres = .*needed|centres = .*at least"):
+            each.compressed(centres)
+
+
+def test_policies_without_samples_of_a_process_are_not_compressed() -> None:
+    kernel = Kernel(factors_of(2), np.ones(2))
+    one, zero = np.zeros((1, 2)), np.zeros(1)
+    for process in (
+        LipschitzPolicy(TASK, kernel, one, one, zero, 1.0, 0.3, 0.3),
+        SoftmaxPolicy(TASK, kernel, one, np.zeros((1, 3)), 0.0, np.zeros((3, 2)), 1.0),
+    ):
+        with pytest.raises(ConfigurationError, match=rf"{type(process).__name__}.*kreps\.KREPS"):
+            Policy(process).compressed(5)
+
+
+def test_the_difference_of_a_compressed_policy_is_told() -> None:
+    exact = Policy(fit(*samples(200, 35)))
+    differences = [mean_difference(exact, exact.compressed(c)) for c in (1, 10, 60)]
+    assert differences[0] > 1.2 * differences[1] > 10.0 * differences[2]
+    assert mean_difference(exact, exact) == 0.0
+    assert isinstance(exact.process, CostSensitiveGP)
+    states = exact.process.states
+    a, b = (p.predict(states, deterministic=True)[0] for p in (exact, exact.compressed(10)))
+    wanted = np.sqrt(np.mean(((a - b) / [1.0, 10.0]) ** 2))
+    np.testing.assert_allclose(differences[1], wanted, rtol=1e-12)
+
+
+def test_predicting_holds_on_to_no_memory() -> None:
+    policy = Policy(fit(*samples(300, 36))).compressed(50)
+    query = np.zeros(2)
+    tracemalloc.start()
+    try:
+        for _ in range(100):
+            policy.predict(query)
+        before = tracemalloc.get_traced_memory()[0]
+        for _ in range(3000):
+            policy.predict(query)
+        gc.collect()
+        grown = tracemalloc.get_traced_memory()[0] - before
+    finally:
+        tracemalloc.stop()
+    assert grown < 2000  # bytes; one number held per call would be 24 times 3000

@@ -11,8 +11,8 @@ import subprocess
 import sys
 import time
 import tracemalloc
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,8 @@ from kreps.errors import StorageError
 from kreps.kernels import Kernel
 from kreps.learner import LEARNERS, Learner
 from kreps.policies import MAX_SUPPORT
-from kreps.storage import POLICY_OF_METHOD
+from kreps.sparse_gp import SparseGP
+from kreps.storage import POLICIES_OF_METHOD
 from kreps.value_policies import LipschitzPolicy
 
 TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
@@ -42,6 +43,15 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "grid_states": 4,
         "grid_actions": 3,
     }
+}
+VARIANTS = [*LEARNERS, "reps, compressed"]
+"""What files are made of: every method, and REPS with a policy of few centres."""
+KIND_OF_VARIANT = {
+    "reps": "cost-sensitive-gp",
+    "reps, compressed": "sparse-gp",
+    "value-iteration": "softmax",
+    "grid-value-iteration": "softmax",
+    "npalp": "lipschitz",
 }
 STATES = np.random.default_rng(0).normal(size=(20, 2))
 NOISE = np.random.default_rng(1).normal(size=(20, 1))
@@ -113,29 +123,38 @@ class Good:
         return self.refused(path)
 
 
-def good_files(learners: Iterable[Learner[Any]], folder: Path) -> dict[str, Good]:
-    """What learners write, by method and kind."""
+def compressed(learner: Learner[Any], centres: int) -> Learner[Any]:
+    """The learner as if its latest policy had few centres."""
+    other = type(learner)(learner.task, seed=learner.seed)
+    other.settings = learner.settings
+    other.state = replace(learner.state, policy=learner.policy.compressed(centres).process)
+    return other
+
+
+def good_files(learners: Mapping[str, Learner[Any]], folder: Path) -> dict[str, Good]:
+    """What learners write, by variant and kind."""
     files = {}
-    for learner in learners:
+    for variant, learner in learners.items():
         for kind, save in zip(KINDS, (learner.policy.save, learner.save), strict=True):
             save(folder / kind)
             content = (folder / kind).read_bytes()
-            files[f"{learner.method} {kind}"] = Good(learner.method, kind, content)
+            files[f"{variant} {kind}"] = Good(learner.method, kind, content)
     return files
 
 
 @pytest.fixture(scope="module")
 def learners() -> dict[str, Learner[Any]]:
-    """One of each method, after two updates."""
-    return {
+    """One of each variant, after two updates."""
+    learnt: dict[str, Learner[Any]] = {
         method: LEARNERS[method](gym.make("kreps/SwingUp-v0"), seed=4, **settings).learn(
             2, progress=False
         )
         for method, settings in SETTINGS.items()
     }
+    return {**learnt, "reps, compressed": compressed(learnt["reps"], 12)}
 
 
-@pytest.fixture(params=LEARNERS)
+@pytest.fixture(params=VARIANTS)
 def learnt(request: pytest.FixtureRequest, learners: dict[str, Learner[Any]]) -> Learner[Any]:
     return learners[request.param]
 
@@ -150,15 +169,15 @@ def one(learners: dict[str, Learner[Any]]) -> Learner[Any]:
 def files(
     learners: dict[str, Learner[Any]], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Good]:
-    return good_files(learners.values(), tmp_path_factory.mktemp("good"))
+    return good_files(learners, tmp_path_factory.mktemp("good"))
 
 
-@pytest.fixture(params=[f"{method} {kind}" for method in LEARNERS for kind in KINDS])
+@pytest.fixture(params=[f"{variant} {kind}" for variant in VARIANTS for kind in KINDS])
 def good(request: pytest.FixtureRequest, files: dict[str, Good]) -> Good:
     return files[request.param]
 
 
-@pytest.fixture(params=[f"{method} checkpoint" for method in LEARNERS])
+@pytest.fixture(params=[f"{variant} checkpoint" for variant in VARIANTS])
 def checkpoint(request: pytest.FixtureRequest, files: dict[str, Good]) -> Good:
     return files[request.param]
 
@@ -258,6 +277,12 @@ def test_a_learner_that_has_learnt_nothing_can_be_saved(method: str, tmp_path: P
     assert_same_state(learner.state, again.state)
 
 
+def test_a_window_without_end_survives_a_checkpoint(tmp_path: Path) -> None:
+    learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]), window=None)
+    learner.save(tmp_path / "x")
+    assert kreps.KREPS.resume(tmp_path / "x").settings.window is None
+
+
 @pytest.mark.parametrize("settings", [{"model": "sample"}, {"features": "grid"}])
 def test_checkpoints_of_the_other_variants_come_back_exactly(
     settings: dict[str, Any], tmp_path: Path
@@ -287,7 +312,41 @@ def test_real_ends_survive_a_checkpoint(tmp_path: Path) -> None:
 def test_files_hold_no_code(good: Good) -> None:
     assert all(values.dtype == np.float64 for values in good.tensors.values())
     assert set(good.header) >= {"kind", "version", "task", "policy"}
-    assert good.header["policy"] == POLICY_OF_METHOD[good.method]
+
+
+def test_every_kind_of_policy_is_among_the_files(files: dict[str, Good]) -> None:
+    found = {name: file.header["policy"] for name, file in files.items()}
+    assert found == {f"{v} {kind}": of for v, of in KIND_OF_VARIANT.items() for kind in KINDS}
+    learnt: dict[str, set[str]] = {method: set() for method in LEARNERS}
+    for name, file in files.items():
+        learnt[file.method].add(found[name])
+    assert learnt == POLICIES_OF_METHOD
+
+
+def test_a_policy_of_few_centres_is_what_was_saved(
+    learners: dict[str, Learner[Any]], tmp_path: Path
+) -> None:
+    few = learners["reps, compressed"].policy
+    few.save(tmp_path / "few")
+    process = kreps.load_policy(tmp_path / "few").process
+    assert isinstance(process, SparseGP)
+    for field in fields(SparseGP):
+        if field.name in ("task", "kernel"):
+            continue
+        np.testing.assert_array_equal(
+            getattr(process, field.name), getattr(few.process, field.name)
+        )
+    assert len(process.states) == 12
+
+
+def test_learning_goes_on_from_a_policy_of_few_centres(
+    learners: dict[str, Learner[Any]], tmp_path: Path
+) -> None:
+    learners["reps, compressed"].save(tmp_path / "x")
+    again = kreps.KREPS.resume(tmp_path / "x", gym.make("kreps/SwingUp-v0"))
+    assert isinstance(again.policy.process, SparseGP)
+    again.learn(1, progress=False)
+    assert again.state.iteration == 3 and again.state.policy is not None
 
 
 # ---- images -----------------------------------------------------------------------------------
@@ -309,22 +368,22 @@ def watching() -> dict[str, Learner[Any]]:
     learners = {method: learner(task) for method, learner in LEARNERS.items()}
     for learner in learners.values():
         learner.update(rollouts)
-    return learners
+    return {**learners, "reps, compressed": compressed(learners["reps"], 3)}
 
 
 @pytest.fixture(scope="module")
 def pictures(
     watching: dict[str, Learner[Any]], tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, Good]:
-    return good_files(watching.values(), tmp_path_factory.mktemp("pictures"))
+    return good_files(watching, tmp_path_factory.mktemp("pictures"))
 
 
-@pytest.mark.parametrize("method", LEARNERS)
+@pytest.mark.parametrize("variant", VARIANTS)
 def test_a_task_of_large_images_comes_back_exactly(
-    method: str, watching: dict[str, Learner[Any]], tmp_path: Path
+    variant: str, watching: dict[str, Learner[Any]], tmp_path: Path
 ) -> None:
-    learner, images = watching[method], np.random.default_rng(7).random((3, 10_000))
-    for file in good_files([learner], tmp_path).values():
+    learner, images = watching[variant], np.random.default_rng(7).random((3, 10_000))
+    for file in good_files({variant: learner}, tmp_path).values():
         again = file.load(tmp_path / file.kind)
         process = again.process if file.kind == "policy" else again.state.policy
         assert process.task.image_shape == (100, 100)
@@ -647,6 +706,9 @@ IMPOSSIBLE: dict[str, dict[str, Callable[[Any], Any]]] = {
     "negative lengthscales of V": {"value.lengthscales": lambda v: -v},
     "tiny lengthscales of V": {"value.lengthscales": put(1, 1e-60)},
     "no samples of a process": none_of("states", "targets", "weights"),
+    "no centres of a process": none_of("states", "mean_weights", "explained"),
+    "explained variance of other centres": {"policy.explained": lambda v: v[:-1, :-1]},
+    "a rank of the explained variance": {"policy.explained": lambda v: v[:-1]},
     "no samples of a softmax": none_of("states", "table"),
     "no samples of slopes": none_of("states", "actions", "bounds"),
     "negative weights": {"policy.weights": lambda v: -v},
@@ -805,7 +867,7 @@ def test_forged_fields_are_refused(
 
 
 def test_a_policy_of_another_kind_is_refused(good: Good, tmp_path: Path) -> None:
-    for kind in {*POLICY_OF_METHOD.values()} - {good.header["policy"]}:
+    for kind in {*KIND_OF_VARIANT.values()} - {good.header["policy"]}:
         good.refused_with(tmp_path / "x", header={**good.header, "policy": kind})
 
 
@@ -813,11 +875,13 @@ def test_a_checkpoint_with_a_policy_that_its_method_does_not_learn_is_refused(
     checkpoint: Good, files: dict[str, Good], tmp_path: Path
 ) -> None:
     own = {n: v for n, v in checkpoint.tensors.items() if not n.startswith("policy.")}
-    kind = POLICY_OF_METHOD[checkpoint.method]
-    for method in (m for m in LEARNERS if POLICY_OF_METHOD[m] != kind):
-        lent = files[f"{method} policy"]
+    learnt = POLICIES_OF_METHOD[checkpoint.method]
+    others = [v for v in VARIANTS if KIND_OF_VARIANT[v] not in learnt]
+    assert len(others) >= 3
+    for variant in others:
+        lent = files[f"{variant} policy"]
         tensors = {**own, **lent.tensors}
-        changes = {"policy": POLICY_OF_METHOD[method], "arrays": sorted(tensors)}
+        changes = {"policy": KIND_OF_VARIANT[variant], "arrays": sorted(tensors)}
         message = checkpoint.refused_with(tmp_path / "x", tensors, {**checkpoint.header, **changes})
         assert "does not learn" in message
 
@@ -860,7 +924,7 @@ def test_forged_checkpoints_are_refused(
         ("grid-value-iteration", "ranges", ["ab", 7, [[1, 0]], [[0, 1, 2]], [[np.nan, 1]]]),
         ("npalp", "noise_fraction", [-0.1, 1.1, np.nan, None]),
         ("npalp", "lipschitz", [0, -1, np.inf]),
-        *((method, "window", [0, -1, 1.5, None, True]) for method in LEARNERS),
+        *((method, "window", [0, -1, 1.5, "all", True]) for method in LEARNERS),
     ],
 )
 def test_forged_settings_are_refused(

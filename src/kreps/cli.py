@@ -1,4 +1,4 @@
-"""The command line: kreps train | resume | evaluate | plot | video | reproduce | search."""
+"""The command line: train, resume, evaluate, plot, video, export, reproduce, search."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.text import Text
 
 import kreps
+from kreps.controller import load_policy, mean_difference
 from kreps.errors import ConfigurationError, EnvironmentFailure, KrepsError
 from kreps.evaluation import EPISODES, STEPS
 from kreps.experiments.cells import name_of
@@ -21,7 +22,7 @@ from kreps.experiments.executors import executor
 from kreps.experiments.figures import draw_features, write_figure
 from kreps.experiments.runner import figure_cells, run_cells
 from kreps.experiments.search import CANDIDATES, search_cells, write_search
-from kreps.experiments.specs import FIGURES, PICTURES
+from kreps.experiments.specs import BEYOND, FIGURES, PICTURES
 from kreps.learner import KREPS
 from kreps.report import (
     evaluate_run,
@@ -48,6 +49,13 @@ SchedulerOption = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Run on the Dask cluster of this scheduler instead."),
 ]
+FAITHFUL = 0.02
+"""Root mean square, in units of the action scale, up to which compressed policies of the swing-up
+lost less than half a reward per step (benchmarks/predict.py)."""
+
+EXPORTS = (".onnx", ".safetensors")
+"""What `export` writes, by the end of the file's name."""
+
 RunArgument = Annotated[Path, typer.Argument(help="Folder of the run.", show_default=False)]
 
 
@@ -183,6 +191,71 @@ def video(
 
 @app.command(
     epilog="Examples:\n\n"
+    "  kreps export runs/swing-up --out policy.onnx\n\n"
+    "  kreps export runs/swing-up --centres 50 --dtype float32 --out policy.onnx\n\n"
+    "  kreps export runs/swing-up/policy.safetensors --centres 50 --out small.safetensors"
+)
+def export(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN_OR_POLICY",
+            help="Folder of the run, or a policy's .safetensors file.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option(help="An .onnx file, or a .safetensors file for kreps.load_policy.")
+    ],
+    centres: Annotated[
+        int | None,
+        typer.Option(min=1, help="Compress to at most so many support points; all if not given."),
+    ] = None,
+    dtype: Annotated[
+        str, typer.Option(help="float64 or float32, of a model's input and outputs.")
+    ] = "float64",
+) -> None:
+    """Write the learnt policy for a controller: as an ONNX model, or compressed.
+
+    A model needs no Python on the robot. Its input is [bold]observation[/bold] (batch, ds), its
+    outputs are [bold]action[/bold] (batch, da), without exploration and within the limits, and
+    [bold]standard_deviation[/bold] (batch, da). Writing it needs: pip install 'kreps\\[onnx]'.
+    """
+    if out.suffix not in EXPORTS:
+        raise ConfigurationError(
+            f"--out {out} is no name for a policy; end it in {' or '.join(EXPORTS)}"
+        )
+    file = _policy_file(source)
+    policy = load_policy(file)
+    if centres is not None:
+        exact, policy = policy, policy.compressed(centres)
+        off = mean_difference(exact, policy)
+        say(f"compressed: at its samples the action is off by {off:.2g} of its scale (rms)")
+        if off > FAITHFUL:
+            say(f"that is more than {FAITHFUL:g}: take more centres, or evaluate it before its use")
+    if out.suffix == ".onnx":
+        arithmetic = policy.export_onnx(out, dtype)
+        how = f"a model with {arithmetic} arithmetic"
+        if dtype == "float32" != arithmetic:
+            how += " (float32 is too coarse for so many centres; --centres 50 mends that)"
+    else:
+        if dtype != "float64":
+            raise ConfigurationError(
+                f"--dtype {dtype}, but .safetensors files of kreps hold float64 only; leave it "
+                "out, or write an .onnx file"
+            )
+        if out.resolve() == file.resolve():
+            raise ConfigurationError(
+                f"--out {out} is the file that is read; the exact policy would be lost, so choose "
+                "another name"
+            )
+        policy.save(out)
+        how = "a policy for kreps.load_policy"
+    say(f"wrote {out}: {how}, {out.stat().st_size / 1e3:.0f} kB")
+
+
+@app.command(
+    epilog="Examples:\n\n"
     "  kreps reproduce figure-1b --trials 10 --workers 2\n\n"
     "  kreps reproduce all\n\n"
     "  kreps reproduce figure-1a --trials 2 --iterations 3 --out small\n\n"
@@ -190,7 +263,11 @@ def video(
 )
 def reproduce(
     figure: Annotated[
-        str, typer.Argument(help=f"One of: {', '.join((*FIGURES, *PICTURES, 'all'))}.")
+        str,
+        typer.Argument(
+            help=f"One of: {', '.join((*FIGURES, *PICTURES, 'all'))} (these); beyond the paper: "
+            f"{', '.join(BEYOND)}."
+        ),
     ],
     trials: Annotated[int, typer.Option(min=1, help="Seeds 0 to TRIALS - 1.")] = 10,
     workers: WorkersOption = 2,
@@ -205,23 +282,23 @@ def reproduce(
     Each cell (method x task x seed) is kept when it is done: stop at any time and call it again.
     Figures share cells, so [bold]all[/bold] costs less than its parts.
     """
-    known = (*FIGURES, *PICTURES)
-    if figure not in (*known, "all"):
-        raise ConfigurationError(
-            f"figure {figure!r} is unknown; choose one of {', '.join((*known, 'all'))}"
-        )
-    wanted = known if figure == "all" else (figure,)
+    known = (*FIGURES, *PICTURES, "all", *BEYOND)
+    if figure not in known:
+        raise ConfigurationError(f"figure {figure!r} is unknown; choose one of {', '.join(known)}")
+    wanted = (*FIGURES, *PICTURES) if figure == "all" else (figure,)
     command = f"kreps reproduce {figure} --trials {trials}"
     if iterations is not None:
         command += f" --iterations {iterations}"
-    cells = {name: figure_cells(name, trials, iterations) for name in wanted if name in FIGURES}
+    cells = {
+        name: figure_cells(name, trials, iterations) for name in wanted if name not in PICTURES
+    }
     results = []
     if cells:
         with executor(workers, scheduler) as pool:
             every_cell = [cell for of_figure in cells.values() for cell in of_figure]
             results = run_cells(every_cell, pool, out / "cells")
     for name in wanted:
-        if name in FIGURES:
+        if name not in PICTURES:
             mine = {cell.name for cell in cells[name]}
             chosen = [result for result in results if name_of(result) in mine]
             for path in write_figure(out, name, command, chosen):
@@ -312,6 +389,19 @@ def _learnt(folder: RunFolder) -> KREPS:
             f"`kreps resume {folder.path}`"
         )
     return KREPS.resume(folder.checkpoint_file, make_environment(config.environment))
+
+
+def _policy_file(source: Path) -> Path:
+    """The policy of a run folder; any other path is that of a policy."""
+    if not source.is_dir():
+        return source
+    folder = RunFolder(source)
+    folder.config()  # complains of a folder that is no run
+    if not folder.policy_file.exists():
+        raise ConfigurationError(
+            f"{source} has no policy yet; make the first update with `kreps resume {source}`"
+        )
+    return folder.policy_file
 
 
 def _learn(folder: RunFolder, learner: KREPS, target: int, report: bool) -> None:

@@ -1,7 +1,8 @@
-"""The policy as its user holds it: predict, save, load."""
+"""The policy as its user holds it: predict, save, load, compress, export."""
 
 from __future__ import annotations
 
+import operator
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,11 @@ import numpy as np
 from kreps import storage
 from kreps.arrays import FloatArray
 from kreps.data import LARGEST, is_sane
-from kreps.errors import DataError
-from kreps.policies import LearntPolicy
+from kreps.errors import ConfigurationError, DataError
+from kreps.export import write_onnx
+from kreps.policies import CostSensitiveGP, LearntPolicy
 from kreps.seeding import Purpose, generator
+from kreps.sparse_gp import SparseGP
 
 
 class Policy:
@@ -25,6 +28,7 @@ class Policy:
 
     def __init__(self, process: LearntPolicy, seed: int = 0) -> None:
         self.process = process
+        self.seed = seed
         self._noise = generator(seed, Purpose.PREDICT)
 
     def predict(
@@ -74,6 +78,88 @@ class Policy:
     def save(self, path: str | Path) -> None:
         """Write the policy as arrays and JSON; read it back with `kreps.load_policy`."""
         storage.save_policy(self.process, path)
+
+    def compressed(self, centres: int) -> Policy:
+        """This policy on at most ``centres`` support points: a smaller model, a faster cycle.
+
+        All samples still count, and far from the centres the exploration is that of the prior.
+        How much performance it costs is worth an evaluation: see ``benchmarks/predict.py``.
+
+        Returns:
+            A policy with this one's seed, or this policy if it was compressed to as few before.
+
+        Raises:
+            ConfigurationError: fewer than one centre, or a policy that has no samples to compress.
+        """
+        try:
+            count = operator.index(centres)
+        except TypeError as error:
+            raise ConfigurationError(
+                f"centres = {centres!r:.40}, but a whole number is needed, such as 50"
+            ) from error
+        if count < 1:
+            raise ConfigurationError(
+                f"centres = {count}, but a policy needs at least one; 50 are often enough"
+            )
+        process = self.process
+        if isinstance(process, CostSensitiveGP):
+            return Policy(process.compressed(count), self.seed)
+        if not isinstance(process, SparseGP):
+            raise ConfigurationError(_no_process(process, "compress"))
+        if len(process.states) > count:
+            raise ConfigurationError(
+                f"the policy was compressed to {len(process.states)} centres before, {count} were "
+                "asked for, and its samples are gone; compress the policy that it was made from"
+            )
+        return self
+
+    def export_onnx(self, path: str | Path, dtype: str = "float64") -> str:
+        """Write an ONNX model of the policy, for controllers without Python.
+
+        Its input is ``observation`` (batch, ds), its outputs are ``action`` (batch, da), the mean
+        clipped to the task's limits, and ``standard_deviation`` (batch, da) of the commanded
+        action, both in the task's units.
+        A model is for following the policy without its exploration.
+
+        Args:
+            path: such as ``policy.onnx``; the folder must exist.
+            dtype: "float64" or "float32", of input and outputs.  All arithmetic is of the same
+                type, unless float32 could put the mean off by 1e-4 of the action scale: then it
+                is float64 all the same.  Compressed policies are well within that.
+
+        Returns:
+            The type of the arithmetic.
+
+        Raises:
+            ConfigurationError: ONNX is not installed (``pip install 'kreps[onnx]'``), or the
+                policy is no Gaussian process.
+            StorageError: the file cannot be written.
+        """
+        process = self.process
+        if isinstance(process, CostSensitiveGP):
+            process = process.predictor
+        if not isinstance(process, SparseGP):
+            raise ConfigurationError(_no_process(process, "export"))
+        return write_onnx(process, Path(path), dtype)
+
+
+def _no_process(process: LearntPolicy, verb: str) -> str:
+    return (
+        f"there is no Gaussian process to {verb} in a policy of type {type(process).__name__}; "
+        "learn one with kreps.KREPS, or save this policy as it is"
+    )
+
+
+def mean_difference(exact: Policy, compressed: Policy) -> float:
+    """Root mean square of what compression does to actions without exploration.
+
+    At the support points of the exact policy, in units of the action scale, after clipping: small
+    where the policy is as good as before, which `kreps.evaluation` can confirm.
+    """
+    process = exact.process
+    assert isinstance(process, CostSensitiveGP | SparseGP)
+    a, b = (p.predict(process.states, deterministic=True)[0] for p in (exact, compressed))
+    return float(np.sqrt(np.mean(((a - b) / process.task.action_scale) ** 2)))
 
 
 def load_policy(path: str | Path, seed: int = 0) -> Policy:

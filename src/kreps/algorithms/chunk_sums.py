@@ -6,7 +6,7 @@ Every class is a function of one chunk that can be sent to another process; what
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
 from typing import TypeVar
@@ -195,6 +195,13 @@ class StreamedProblem:
     @property
     def rank(self) -> int:
         return len(self.rows.changes.start)
+
+    def part(self, chosen: slice) -> StreamedProblem:
+        """That of some of the chunks."""
+        rewards = self.dataset.split(self.rewards)[chosen]
+        return replace(
+            self, dataset=Dataset(self.dataset.chunks[chosen]), rewards=np.concatenate(rewards)
+        )
 
     def bellman_errors(self, theta: FloatArray) -> FloatArray:
         return np.concatenate(list(self._map(ChunkErrors(self.rows, theta))))

@@ -54,6 +54,9 @@ EXACT_LIMIT = 3_000
 SAMPLE = 10_000
 """Samples among which bases are chosen and hyper-parameters fitted, where there are more."""
 
+GROWTH = 4
+"""How many times more samples each solution of the dual has than the one that it starts from."""
+
 
 def applies(settings: Settings, samples: int) -> bool:
     """Whether an update from so many samples is of low rank."""
@@ -126,7 +129,7 @@ def update(
         eta_floor=max(settings.eta_floor, ETA_LEAST),
         compute=compute,
     )
-    dual = solve(problem, sample, sampled)
+    dual = solve(problem, settings, sample, sampled)
     clock.lap("dual")
 
     # Sec. 2: generalise the weighted samples to a stochastic policy
@@ -197,25 +200,41 @@ def choose_centres(
 ) -> RKHSBasis:
     """The same with features that belong to some of the points.
 
-    The policy asks for these in any case: random Fourier features repeat themselves, so that a
-    process made of them is sure of itself where it has never been.
+    The policy asks for these in any case: they tell where there are no samples, so that its
+    variance there is the prior's, which a process made of random Fourier features underestimates.
     """
     if settings.approximation == "uniform":
         return RKHSBasis.uniform(kernel, points, max_rank=rank, rng=rng)
     return RKHSBasis.fit(kernel, points, tolerance=settings.basis_tolerance, max_rank=rank)[0]
 
 
-def solve(problem: StreamedProblem, sample: Transitions, sampled: IntArray) -> DualSolution:
-    """The dual on the sample, in memory; and from there on all samples, if there are more."""
+def solve(
+    problem: StreamedProblem, settings: Settings, sample: Transitions, sampled: IntArray
+) -> DualSolution:
+    """The dual on the sample, in memory; then on more and more chunks, each from the last solution.
+
+    A pass over all samples costs much more than one over a few, so Newton's method is to begin
+    there near its end.
+    """
     rows = problem.rows
     near = DualProblem(
         rewards=problem.rewards[sampled],
         differences=replace(rows, changes=replace(rows.changes, place=as_float))(sample),
         kl_bound=problem.kl_bound,
-        ridge=problem.ridge,
+        ridge=settings.ridge / min(GROWTH * len(sampled), len(problem.rewards)),
         eta_floor=problem.eta_floor,
     )
     dual = solve_dual(near)
     if len(sampled) == len(problem.rewards):
         return dual
-    return solve_dual(problem, start=(dual.eta, dual.theta))
+    stride = 1
+    while len(problem.rewards) >= 2 * GROWTH * stride * SAMPLE:
+        stride *= GROWTH
+    while stride:
+        part = problem.part(slice(None, None, stride))
+        part = replace(
+            part, ridge=settings.ridge / min(GROWTH * len(part.rewards), len(problem.rewards))
+        )
+        dual = solve_dual(part, start=(dual.eta, dual.theta))
+        stride //= GROWTH
+    return dual

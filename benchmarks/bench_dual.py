@@ -1,0 +1,75 @@
+"""Newton's method on the dual of the bounded update."""
+
+from __future__ import annotations
+
+import flops
+import numpy as np
+import pytest
+from criteria import Seconds, Share
+from data import swing_up
+from measuring import Measure
+
+from kreps.algorithms.reps import feature_differences
+from kreps.algorithms.transition_model import state_kernel, successor_features
+from kreps.arrays import FloatArray
+from kreps.dual import DualProblem, Moments, solve_dual, standardise
+from kreps.value import RKHSBasis
+
+
+class Counting(DualProblem):
+    """Counts the Hessians that a solve asks for."""
+
+    asked = 0
+
+    def moments(self, eta: float, theta: FloatArray, *, scatter: bool) -> Moments:
+        Counting.asked += scatter
+        return super().moments(eta, theta, scatter=scatter)
+
+
+def hessians(problem: DualProblem) -> int:
+    """How many a solve of the problem needs."""
+    Counting.asked = 0
+    assert solve_dual(Counting(**vars(problem))).converged
+    return Counting.asked
+
+
+@pytest.mark.parametrize("n", [1500, 3000])
+def bench_newton_iteration(measure: Measure, n: int) -> None:
+    """As many features as samples; the time of a whole solve counts all its iterations."""
+    rng = np.random.default_rng(n)
+    rewards, _ = standardise(rng.standard_normal(n))
+    problem = DualProblem(rewards, rng.standard_normal((n, n)), 0.5, 100.0, 1e-6)
+    count = hessians(problem)
+    measured = measure(
+        "Newton iterations, m = n",
+        f"n = {n}",
+        lambda: solve_dual(problem),
+        Share(count * flops.newton(n, n), at_least=0.55),
+    )
+    measured.details["hessians"] = count
+
+
+def bench_newton_solve(measure: Measure) -> None:
+    """From a cold start, on features and rewards of the swing-up."""
+    data = swing_up(1500)
+    learner, transitions = data.learner, data.transitions
+    kernel = state_kernel(transitions, learner.task, np.random.default_rng(0))
+    basis, features = RKHSBasis.fit(kernel, transitions.points, tolerance=0.0, max_rank=300)
+    assert features.shape[1] == 300, basis.residual
+    rewards, _ = standardise(transitions.rewards)
+    problem = DualProblem(
+        rewards,
+        feature_differences(transitions, features, successor_features(transitions, features), 0.02),
+        learner.settings.kl_bound,
+        learner.settings.ridge / len(rewards),
+        learner.settings.eta_floor,
+    )
+    count = hessians(problem)
+    measured = measure(
+        "Newton solve, m = 300",
+        f"n = {len(rewards)}",
+        lambda: solve_dual(problem),
+        Seconds(at_most=0.03),
+        Share(count * flops.newton(len(rewards), 300)),
+    )
+    measured.details["hessians"] = count

@@ -1,0 +1,104 @@
+"""The conditional embedding, and the fits of hyper-parameters."""
+
+from __future__ import annotations
+
+import flops
+import numpy as np
+from criteria import Seconds, Share
+from data import swing_up
+from measuring import Measure
+
+from kreps.algorithms.reps import PolicySamples, policy_hyperparameters, value_basis
+from kreps.algorithms.transition_model import (
+    FIT_SAMPLE,
+    fit_embedding,
+    state_kernel,
+    successor_features,
+)
+from kreps.embedding import KernelEmbedding
+from kreps.hyperparameters import EmbeddingLoss, PolicyLoss, factor_distances
+from kreps.kernels import Kernel, SquaredExponential, median_lengthscales
+
+N = 1500
+RNG = np.random.default_rng
+
+
+class Prepared:
+    """What the stages before would hand on."""
+
+    def __init__(self) -> None:
+        data = swing_up(N)
+        self.task, self.settings = data.learner.task, data.learner.settings
+        self.transitions = data.transitions
+        self.kernel = state_kernel(self.transitions, self.task, RNG(0))
+        _, features = value_basis(self.transitions, self.kernel, self.settings)
+        self.successors = successor_features(self.transitions, features)
+        self.changes = self.successors - features[self.transitions.state]
+        actions = self.task.scaled(self.task.clip(self.transitions.actions))
+        self.inputs = np.concatenate([self.transitions.states, actions], axis=1)
+        factors = (*self.kernel.factors, SquaredExponential((self.inputs.shape[1] - 1,)))
+        self.input_kernel = Kernel(factors, median_lengthscales(factors, self.inputs, RNG(1)))
+        p = RNG(2).uniform(0.2, 1.0, N)
+        self.samples = PolicySamples.of(self.transitions, p / p.sum(), self.task)
+
+
+def bench_embedding(measure: Measure) -> None:
+    p = Prepared()
+    rank = p.changes.shape[1]
+    measure(
+        "embedding, fit and expected features",
+        f"n = {N}, {rank} features",
+        lambda: KernelEmbedding.fit(p.input_kernel, p.inputs, 1e-3).expected_features(p.changes),
+        Share(flops.cholesky(N) + flops.solve(N, rank)),
+    )
+
+
+def bench_embedding_loss(measure: Measure) -> None:
+    p = Prepared()
+    rows = slice(0, FIT_SAMPLE)
+    rank = p.changes.shape[1]
+    loss = EmbeddingLoss(factor_distances(p.input_kernel.factors, p.inputs[rows]), p.changes[rows])
+    x = np.append(np.log(p.input_kernel.lengthscales), np.log(1e-3))
+    measure(
+        "loss of the embedding, with gradient",
+        f"{FIT_SAMPLE} samples, {rank} features",
+        lambda: loss(x),
+        Share(flops.embedding_loss(FIT_SAMPLE, rank)),
+    )
+
+
+def bench_policy_loss(measure: Measure) -> None:
+    p = Prepared()
+    rows = slice(0, FIT_SAMPLE)
+    loss = PolicyLoss(
+        factor_distances(p.kernel.factors, p.samples.states[rows]),
+        p.samples.targets[rows],
+        p.samples.weights[rows],
+    )
+    x = np.append(np.log(p.kernel.lengthscales), np.log([1.0, 0.3]))
+    measure(
+        "loss of the policy, with gradient",
+        f"{FIT_SAMPLE} samples",
+        lambda: loss(x),
+        Share(flops.policy_loss(FIT_SAMPLE)),
+    )
+
+
+def bench_embedding_fit(measure: Measure) -> None:
+    p = Prepared()
+    measure(
+        "fit of the embedding, cold start",
+        f"n = {N}, of which {FIT_SAMPLE} searched",
+        lambda: fit_embedding(p.transitions, p.changes, p.kernel, p.task, None, RNG(3)),
+        Seconds(),
+    )
+
+
+def bench_policy_fit(measure: Measure) -> None:
+    p = Prepared()
+    measure(
+        "hyper-parameters of the policy, cold start",
+        f"n = {N}, of which {FIT_SAMPLE} searched",
+        lambda: policy_hyperparameters(p.samples, p.kernel, p.settings, None, RNG(3)),
+        Seconds(),
+    )

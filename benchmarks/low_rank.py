@@ -1,0 +1,294 @@
+"""Low rank against exact, and how its cost grows: pictures and numbers for docs/performance.md.
+
+python benchmarks/low_rank.py accuracy    # error of one update against the exact one, by rank
+python benchmarks/low_rank.py variance    # what each policy says far from its data
+python benchmarks/low_rank.py scale       # CPU time and memory for 10^4 to 10^6 samples
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
+import kreps
+from kreps.data import TaskSpec
+from kreps.dataset import CHUNK
+from kreps.experiments.runner import commit
+from kreps.experiments.tables import markdown
+from kreps.kernels import Kernel, factors_of
+from kreps.plotting import BLUE, GREY, ORANGE, STYLE
+from kreps.policies import BangBang, CostSensitiveGP
+from kreps.rollout import simulate
+from kreps.sparse_gp import PolicySums, SparseGP
+from kreps.value import FourierBasis, RKHSBasis
+
+TASK = "kreps/SwingUp-v0"
+SEEDS = range(110, 115)  # not those of any reported result
+RANKS = (25, 50, 100, 200, 400, 800)
+WAYS = {"pivoted": BLUE, "uniform": ORANGE, "fourier": "#3a923a"}
+SIZES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
+
+
+def write(out: Path, name: str, content: dict[str, Any], figure: Figure, table: str) -> None:
+    """Numbers, picture and table, with the command and the commit that made them."""
+    command = f"python benchmarks/low_rank.py {name}"
+    out.mkdir(parents=True, exist_ok=True)
+    text = json.dumps({"command": command, "commit": commit(), **content}, indent=2)
+    (out / f"low-rank-{name}.json").write_text(text + "\n")
+    (out / f"low-rank-{name}.md").write_text(table + "\n")
+    figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))  # room for the source
+    figure.text(0.01, 0.01, f"{command}   (commit {commit()})", fontsize=6, color=GREY)
+    figure.savefig(out / f"low-rank-{name}.png", dpi=130, metadata={"Software": None})
+
+
+# ---- accuracy ---------------------------------------------------------------------------------
+
+
+def errors(seed: int) -> dict[str, dict[int, tuple[float, float, float]]]:
+    """Of weights, V and policy, by way and rank, at the ninth update of a learner."""
+    env = gym.make(TASK)
+    learner = kreps.KREPS(env, seed=seed)
+    learner.learn(8, progress=False)
+    state, fresh = learner.state, learner._collect(learner.env, None)
+    states = np.concatenate([rollout.observations for rollout in fresh])
+
+    def updated(approximation: str, rank: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        learner.state = state
+        learner.settings = replace(
+            learner.settings, approximation=approximation, rank=rank, max_rank=rank
+        )
+        info = learner.update(fresh)
+        policy = learner.state.policy
+        assert policy is not None
+        value = learner.value_function(states)
+        return info.dual.weights, value - value.mean(), policy.greedy(states)
+
+    exact = updated("exact", 400)
+    found: dict[str, dict[int, tuple[float, float, float]]] = {}
+    for way in WAYS:
+        for rank in RANKS:
+            weights, value, actions = updated(way, rank)
+            found.setdefault(way, {})[rank] = (
+                float(np.abs(weights - exact[0]).sum() / 2.0),
+                float((value - exact[1]).std() / exact[1].std()),
+                float(np.sqrt(np.mean((actions - exact[2]) ** 2)) / learner.task.action_scale[0]),
+            )
+    return found
+
+
+def accuracy(out: Path) -> None:
+    with kreps_threads():
+        by_seed = [errors(seed) for seed in SEEDS]
+    names = ("weights (total variation)", "V (share of its spread)", "mean action (of half range)")
+    with rc_context(STYLE):
+        figure = Figure(figsize=(9.0, 3.2), layout="constrained")
+        axes = figure.subplots(1, 3, sharex=True)
+        for i, (axis, name) in enumerate(zip(axes, names, strict=True)):
+            for way, colour in WAYS.items():
+                values = np.array([[seed[way][rank][i] for rank in RANKS] for seed in by_seed])
+                axis.loglog(RANKS, np.maximum(values.T, 1e-6), color=colour, lw=0.6, alpha=0.4)
+                middle = np.maximum(np.median(values, axis=0), 1e-6)
+                axis.loglog(RANKS, middle, "o-", color=colour, ms=3, label=way)
+            axis.set_title(name, fontsize=9)
+            axis.set_xlabel("rank of every basis")
+            axis.set_xticks(RANKS, [str(rank) for rank in RANKS])
+            axis.minorticks_off()
+        axes[0].set_ylabel("distance from the exact update")
+        axes[0].legend(frameon=False)
+    rows = [
+        [way, str(rank)]
+        + [f"{np.median([seed[way][rank][i] for seed in by_seed]):.1e}" for i in range(3)]
+        for way in WAYS
+        for rank in RANKS
+    ]
+    content = {"seeds": list(SEEDS), "errors": by_seed}
+    write(out, "accuracy", content, figure, markdown(["basis", "rank", *names], rows))
+
+
+# ---- variance ---------------------------------------------------------------------------------
+
+
+def variance(out: Path) -> None:
+    """Samples on the left, nothing on the right."""
+    rng = np.random.default_rng(0)
+    task = TaskSpec(1, np.array([-1.0]), np.array([1.0]))
+    kernel = Kernel(factors_of(1), np.array([0.3]))
+    states = rng.uniform(-2.0, 0.0, (400, 1))
+    targets = np.sin(4.0 * states) + 0.3 * rng.standard_normal((400, 1))
+    weights, signal, noise = np.ones(400), 1.0, 0.1
+    exact = CostSensitiveGP(task, kernel, states, targets, weights, signal, noise)
+    x = np.linspace(-2.5, 2.5, 501)[:, None]
+
+    def regressors(basis: RKHSBasis | FourierBasis) -> np.ndarray:
+        """Subset of regressors: only the part of the variance that the features can express."""
+        sums = PolicySums.of(basis.features(states), weights, targets)
+        z = basis.features(x)
+        p = np.eye(z.shape[1]) + signal / noise * sums.precision
+        explained = signal * np.einsum("ij,ij->i", z, np.linalg.solve(p, z.T).T)
+        return np.sqrt(explained + noise)[:, None]
+
+    pivoted, features = RKHSBasis.fit(kernel, states, tolerance=1e-6, max_rank=20)
+    ours = SparseGP.fit(task, pivoted, PolicySums.of(features, weights, targets), signal, noise)
+    fourier = FourierBasis.draw(kernel, 1, max_rank=20, rng=rng)
+    curves: dict[str, tuple[np.ndarray, str, str]] = {
+        "exact": (exact.standard_deviation(x), GREY, "-"),
+        "20 centres, projected process (kreps)": (ours.standard_deviation(x), BLUE, "--"),
+        "20 centres, subset of regressors": (regressors(pivoted), ORANGE, "-"),
+        "20 Fourier features": (regressors(fourier), "#3a923a", "-"),
+    }
+    with rc_context(STYLE):
+        figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+        axis = figure.subplots()
+        for name, (values, colour, line) in curves.items():
+            axis.plot(x[:, 0], values[:, 0], line, color=colour, label=name)
+        axis.axhline(np.sqrt(signal + noise), color=GREY, lw=0.6, ls=":")
+        axis.axvspan(-2.0, 0.0, color=GREY, alpha=0.1, lw=0)
+        axis.set_xlabel("state (samples only in the grey part)")
+        axis.set_ylabel("standard deviation of the action")
+        axis.set_ylim(0.0, 1.2)
+        axis.legend(frameon=False, fontsize=8, loc="lower right")
+    far = {name: float(values[-1, 0]) for name, (values, _, _) in curves.items()}
+    rows = [[name, f"{value:.3f}"] for name, value in far.items()]
+    content = {"prior": float(np.sqrt(signal + noise)), "far_from_all_samples": far}
+    write(out, "variance", content, figure, markdown(["policy", "deviation at state 2.5"], rows))
+
+
+# ---- scale ------------------------------------------------------------------------------------
+
+
+def make_data(folder: Path, n: int, steps: int = 50) -> None:
+    """n steps of the first policy, laid end to end."""
+    env = gym.make(TASK)
+    task = kreps.KREPS(env).task
+    policy, count, at_once = BangBang(task), n // steps, 2000
+    parts = []
+    for first in range(0, count, at_once):
+        seeds = range(first, min(first + at_once, count))
+        noise = [np.random.default_rng([1, j]) for j in seeds]
+        parts += simulate(env, task, policy, seeds, noise, [steps] * len(seeds))
+    np.save(folder / "observations.npy", np.concatenate([r.observations for r in parts]))
+    np.save(folder / "actions.npy", np.concatenate([r.actions for r in parts]))
+    np.save(folder / "rewards.npy", np.concatenate([r.rewards for r in parts]))
+
+
+def one_size(folder: Path, n: int, options: dict[str, Any], steps: int = 50) -> dict[str, Any]:
+    """CPU seconds by stage and peak memory of one update; in a process of its own."""
+    count = n // steps
+    maps = [
+        np.load(folder / f"{name}.npy", mmap_mode="r")
+        for name in ("observations", "actions", "rewards")
+    ]
+    data = kreps.Dataset.from_arrays(
+        maps[0][: n + count], maps[1][:n], maps[2][:n], [steps] * count
+    )
+    learner = kreps.KREPS(gym.make(TASK), seed=0, **options)
+    started = time.process_time()
+    info = learner.update(data)
+    seconds = time.process_time() - started
+    return {
+        "samples": n,
+        "cpu_seconds": seconds,
+        "stages": info.seconds,
+        "newton_iterations": info.dual.iterations,
+        "outcome": info.dual.outcome.name,
+        "rank_of_v": info.rank,
+        "support": info.support,
+        "peak_memory_gb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+    }
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "defaults (rank 1000, V up to 400)": {},
+    # pivots stop when a basis is complete; random ones do not
+    "every rank 1000": {"approximation": "uniform", "max_rank": 1000},
+}
+
+
+def scale(out: Path, largest: int) -> None:
+    sizes = [n for n in SIZES if n <= largest]
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in VARIANTS}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        make_data(folder, sizes[-1])
+        for n in sizes:
+            for variant, options in VARIANTS.items():
+                with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
+                    row = fresh.submit(one_size, folder, n, options).result()
+                found[variant].append(row)
+                print(variant, row, flush=True)
+    slopes = {}
+    with rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        for (variant, rows), colour in zip(found.items(), (BLUE, ORANGE), strict=True):
+            x = [row["samples"] for row in rows]
+            y = [row["cpu_seconds"] for row in rows]
+            large = [i for i, n in enumerate(x) if n >= 30_000]
+            slope = np.polyfit(np.log([x[i] for i in large]), np.log([y[i] for i in large]), 1)[0]
+            slopes[variant] = float(slope)
+            left.loglog(x, y, "o-", color=colour, ms=3, label=f"{variant}: slope {slope:.2f}")
+            right.semilogx(x, [r["peak_memory_gb"] for r in rows], "o-", color=colour, ms=3)
+        left.set_ylabel("CPU seconds of one update, one core")
+        right.set_ylabel("peak memory of the process [GB]")
+        right.set_ylim(0.0)
+        left.legend(frameon=False, fontsize=8)
+        for axis in (left, right):
+            axis.set_xlabel("samples")
+    table = markdown(
+        ["variant", "samples", "CPU s", "of it the dual", "Newton iterations", "peak GB"],
+        [
+            [
+                variant,
+                f"{row['samples']:,}",
+                f"{row['cpu_seconds']:.1f}",
+                f"{row['stages']['dual']:.1f}",
+                str(row["newton_iterations"]),
+                f"{row['peak_memory_gb']:.2f}",
+            ]
+            for variant, rows in found.items()
+            for row in rows
+        ],
+    )
+    content = {"chunk": CHUNK, "slopes_from_30000": slopes, "rows": found}
+    write(out, "scale", content, figure, table)
+
+
+def kreps_threads() -> Any:
+    from kreps.threads import blas_threads
+
+    return blas_threads(1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("what", choices=["accuracy", "variance", "scale"])
+    parser.add_argument("--out", type=Path, default=Path("results"))
+    parser.add_argument("--largest", type=int, default=SIZES[-1], help="of the sizes of scale")
+    asked = parser.parse_args()
+    work: dict[str, Callable[[], None]] = {
+        "accuracy": lambda: accuracy(asked.out),
+        "variance": lambda: variance(asked.out),
+        "scale": lambda: scale(asked.out, asked.largest),
+    }
+    work[asked.what]()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

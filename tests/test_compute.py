@@ -1,0 +1,228 @@
+"""Who works on the chunks: order, bounds, errors, and the same policy from every executor."""
+
+from __future__ import annotations
+
+import pickle
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+import kreps
+from kreps import dataset as dataset_module
+from kreps.algorithms import low_rank_reps
+from kreps.compute import AHEAD, Compute
+from kreps.data import Rollout, TaskSpec
+from kreps.dataset import Dataset
+from kreps.errors import DataError
+from kreps.policies import BangBang
+from kreps.rollout import collect
+
+TASK = TaskSpec(2, [-30.0], [30.0], (0,))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def threads() -> Iterator[Executor]:
+    with ThreadPoolExecutor(40) as pool:
+        yield pool
+
+
+class Recorder(Executor):
+    """Does at once what it is given, and counts it."""
+
+    def __init__(self) -> None:
+        self.submitted = 0
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        self.submitted += 1
+        future: Future[Any] = Future()
+        future.set_result(fn(*args, **kwargs))
+        return future
+
+
+# ---- order, bounds, errors --------------------------------------------------------------------
+
+
+def test_results_come_in_the_order_of_the_arguments_whoever_was_first(threads: Executor) -> None:
+    finished: list[int] = []
+
+    def slow_at_first(i: int, name: str) -> tuple[int, str]:
+        time.sleep(0.03 if i % 8 == 0 else 0.0)
+        finished.append(i)
+        return i, name
+
+    names = [str(i) for i in range(40)]
+    found = list(Compute(threads).map(slow_at_first, range(40), names))
+    assert found == list(zip(range(40), names, strict=True))
+    assert sorted(finished) == list(range(40)) != finished
+
+
+@pytest.mark.parametrize("executor", [None, Recorder()], ids=["here", "executor"])
+@pytest.mark.parametrize("count", [0, 1, AHEAD - 1, AHEAD, AHEAD + 1, 3 * AHEAD])
+def test_every_argument_has_its_result(executor: Executor | None, count: int) -> None:
+    assert list(Compute(executor).map(str, range(count))) == [str(i) for i in range(count)]
+
+
+def test_no_more_chunks_are_under_way_than_agreed() -> None:
+    recorder, asked = Recorder(), []
+
+    def arguments() -> Iterator[int]:
+        for i in range(5 * AHEAD):
+            asked.append(i)
+            yield i
+
+    results = Compute(recorder).map(abs, arguments())
+    for taken in range(5 * AHEAD):
+        assert recorder.submitted == min(taken + AHEAD - 1 if taken else 0, 5 * AHEAD)
+        assert len(asked) == recorder.submitted  # not even the arguments are made before
+        next(results)
+
+
+def test_no_more_workers_are_busy_than_agreed(threads: Executor) -> None:
+    lock, busy, most = threading.Lock(), 0, 0
+
+    def work(_: int) -> None:
+        nonlocal busy, most
+        with lock:
+            busy += 1
+            most = max(most, busy)
+        time.sleep(0.002)
+        with lock:
+            busy -= 1
+
+    list(Compute(threads).map(work, range(100)))
+    assert 2 <= most <= AHEAD
+
+
+@pytest.mark.parametrize("where", ["here", "threads"])
+def test_an_error_comes_out_as_it_was_raised(where: str, threads: Executor) -> None:
+    def fails_at_seven(i: int) -> int:
+        if i == 7:
+            raise DataError("seven")
+        return i
+
+    results = Compute(threads if where == "threads" else None).map(fails_at_seven, range(30))
+    found = []
+    with pytest.raises(DataError, match="seven"):
+        for each in results:
+            found.append(each)
+    assert found == list(range(7))
+
+
+# ---- the same policy from all -----------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def rollouts() -> list[Rollout]:
+    return collect(
+        gym.make("kreps/SwingUp-v0"),
+        TASK,
+        BangBang(TASK),
+        6,
+        seed=1,
+        iteration=0,
+        restart_probability=0.02,
+    )
+
+
+@pytest.fixture
+def folder(rollouts: list[Rollout], tmp_path: Path) -> Path:
+    for i in range(3):
+        kreps.save_rollouts(rollouts[2 * i : 2 * i + 2], tmp_path / f"{i}.safetensors")
+    return tmp_path
+
+
+@pytest.fixture(autouse=True)
+def streamed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chunks so short, and samples so few, that every sum is taken over several chunks."""
+    monkeypatch.setattr(dataset_module, "CHUNK", 100)
+    monkeypatch.setattr(low_rank_reps, "SAMPLE", 200)
+
+
+def allow_two_blas_threads() -> None:
+    threadpool_limits(2, user_api="blas")
+
+
+def blas_threads_used(*_: int) -> set[int]:
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+@pytest.fixture(scope="module")
+def processes() -> Iterator[Executor]:
+    """Two workers, left to themselves with two BLAS threads each."""
+    with ProcessPoolExecutor(
+        2, mp_context=get_context("spawn"), initializer=allow_two_blas_threads
+    ) as pool:
+        yield pool
+
+
+def test_chunks_are_worked_on_by_one_blas_thread(processes: Executor) -> None:
+    assert list(Compute(processes).map(blas_threads_used, range(4))) == [{1}] * 4
+    assert processes.submit(blas_threads_used).result() == {2}
+
+
+def learnt(given: Dataset | list[Rollout], executor: Executor | None, path: Path) -> bytes:
+    """All that is learnt, as a file."""
+    learner = kreps.KREPS(
+        TASK, approximation="pivoted", max_rank=60, rank=60, compute=Compute(executor)
+    )
+    learner.update(given)
+    learner.save(path)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("form", ["list", "set", "arrays", "folder"])
+def test_processes_learn_the_same_policy_to_the_last_byte(
+    form: str, rollouts: list[Rollout], folder: Path, processes: Executor
+) -> None:
+    given: Dataset | list[Rollout] = {
+        "list": lambda: rollouts,
+        "set": lambda: Dataset.of(rollouts),
+        "arrays": lambda: Dataset.from_arrays(
+            np.concatenate([r.observations for r in rollouts]),
+            np.concatenate([r.actions for r in rollouts]),
+            np.concatenate([r.rewards for r in rollouts]),
+            [len(r) for r in rollouts],
+        ),
+        "folder": lambda: kreps.rollout_folder(folder),
+    }[form]()
+    here = learnt(given, None, folder / "here.ckpt")
+    assert learnt(given, processes, folder / "there.ckpt") == here
+
+
+def test_a_dask_cluster_learns_the_same_policy(folder: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    files = kreps.rollout_folder(folder)
+    here = learnt(files, None, folder / "here.ckpt")
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster) as client,
+    ):
+        there = learnt(files, client.get_executor(), folder / "there.ckpt")
+    assert there == here
+
+
+def test_a_chunk_that_a_worker_cannot_read_ends_the_update(
+    folder: Path, processes: Executor
+) -> None:
+    files = kreps.rollout_folder(folder)
+    learner = kreps.KREPS(TASK, compute=Compute(processes))
+    (folder / "1.safetensors").unlink()
+    with pytest.raises(kreps.StorageError, match=r"1\.safetensors"):
+        learner.update(files)
+    assert learner.state.iteration == 0
+
+
+def test_what_is_sent_to_a_worker_does_not_hold_the_files_it_reads(folder: Path) -> None:
+    chunk = kreps.rollout_folder(folder).chunks[0]
+    assert len(pickle.dumps(chunk)) < 1000
