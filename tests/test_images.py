@@ -65,7 +65,7 @@ def test_gram_matrices_are_positive_semi_definite(shape: tuple[int, int]) -> Non
 
 
 @pytest.mark.parametrize("shape", [(20, 20), (7, 12), (12, 7)])
-def test_distances_are_those_of_an_explicit_smoothing(shape: tuple[int, int]) -> None:
+def test_distances_are_those_of_an_explicitsmoothing(shape: tuple[int, int]) -> None:
     height, width = shape
     x = np.random.default_rng(1).normal(size=(5, height * width))
     found = SmoothedImage(tuple(range(height * width)), shape).coordinates(x)

@@ -44,7 +44,11 @@ def as_numpy(array: Array) -> FloatArray:
     """``array`` in NumPy, on the CPU."""
     if isinstance(array, np.ndarray):
         return array
-    return np.asarray(array_api_compat.to_device(array, "cpu"))
+    if array_api_compat.is_torch_array(array):
+        return array.cpu().numpy()
+    if array_api_compat.is_cupy_array(array):
+        return array.get()
+    return np.from_dlpack(array, device="cpu")
 
 
 def columns(array: Array, chosen: Sequence[int]) -> Array:

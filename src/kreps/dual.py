@@ -315,6 +315,9 @@ GAP_TOLERANCE = 1e-6
 KL_TOLERANCE = 1e-4  # relative to the bound
 """All three are asked for: the decrement alone lies as eta -> 0, where the curvature explodes."""
 
+LAST_BUT_ONE = 1e-5
+"""Decrement after which one more step is expected to be the last."""
+
 
 def solve_dual(
     problem: Problem,
@@ -389,31 +392,45 @@ def _newton(
         jitter = max(jitter, factor.jitter)
         slope = float(g_theta @ step) + eta * g_eta * stretch
         decrement = -0.5 * slope
-        kl_met = not moves_eta or abs(g_eta) <= KL_TOLERANCE * problem.kl_bound
-        gap = float(g_theta @ g_theta) / (2.0 * problem.ridge)
-        if decrement <= DECREMENT_TOLERANCE and gap <= GAP_TOLERANCE and kl_met:
+        if _done(problem, g_eta if moves_eta else 0.0, g_theta, decrement):
             return _Progress(eta, theta, here, decrement, iteration, jitter, True)
         least = max(0.5, floor / eta) - 1.0  # eta at most halves and never passes its floor
         length = 1.0 if stretch >= least else least / stretch
         rounding = 1e-14 * max(1.0, abs(value))
-        first = True  # mostly good enough, so its curvature is taken in the same pass
+        # The first try is mostly good enough, so its curvature is taken in the same pass; but
+        # where it should be the last, by quadratic convergence, none may be needed.
+        scatter = decrement > LAST_BUT_ONE
         while length > 1e-12:
             new_eta = max(eta * (1.0 + length * stretch), floor)
             if new_eta <= floor * (1.0 + 1e-9):
                 new_eta = floor  # exactly, not a rounding error above it
             new_theta = theta + length * step
-            there = problem.moments(new_eta, new_theta, scatter=first)
+            there = problem.moments(new_eta, new_theta, scatter=scatter)
             new_value = _value(problem, new_theta, there)
             if new_value <= value + 1e-4 * length * slope + rounding:
                 break
             length *= 0.5
-            first = False
+            scatter = False
         else:
             return _Progress(eta, theta, here, decrement, iteration, jitter, False)
         eta, theta, value, here = new_eta, new_theta, new_value, there
         if here.scatter is None:
+            g_eta, g_theta = _gradient(problem, theta, here)
+            g = np.append(g_theta, eta * g_eta) if moves_eta else g_theta
+            decrement = 0.5 * float(g @ factor.solve(g))
+            # by the last Hessian, hence the margin; where eta comes to its floor or leaves it, no
+            settled = eta > floor if moves_eta else g_eta >= 0 or not eta_free
+            if settled and _done(problem, g_eta if moves_eta else 0.0, g_theta, 10.0 * decrement):
+                return _Progress(eta, theta, here, decrement, iteration + 1, jitter, True)
             here = problem.moments(eta, theta, scatter=True)
     return _Progress(eta, theta, here, decrement, max_iterations, jitter, False)
+
+
+def _done(problem: Problem, g_eta: float, g_theta: FloatArray, decrement: float) -> bool:
+    """Whether a gradient and its Newton decrement are small enough."""
+    gap = float(g_theta @ g_theta) / (2.0 * problem.ridge)
+    kl_met = abs(g_eta) <= KL_TOLERANCE * problem.kl_bound
+    return decrement <= DECREMENT_TOLERANCE and gap <= GAP_TOLERANCE and kl_met
 
 
 def _bisection(problem: Problem, stalled: _Progress) -> _Progress:

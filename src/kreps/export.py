@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from kreps.arrays import FloatArray
 from kreps.errors import ConfigurationError
-from kreps.kernels import Factor, Periodic, SmoothedImage, SquaredExponential, _smoothing
+from kreps.kernels import Factor, Periodic, SmoothedImage, SquaredExponential, smoothing
 from kreps.sparse_gp import SparseGP
 from kreps.storage import write_atomically
 
@@ -233,7 +233,7 @@ def _coordinates(graph: _Graph, factor: Factor, observation: str, name: str) -> 
     if isinstance(factor, Periodic):
         parts = [graph.node(operation, columns) for operation in ("Cos", "Sin")]
         return graph.node("Concat", *parts, axis=1)
-    down, across = (_smoothing(size) for size in factor.shape)
+    down, across = (smoothing(size) for size in factor.shape)
     shape = graph.integers(f"{name}_shape", [0, *factor.shape])  # 0: as many as came in
     image = graph.node("Reshape", columns, shape)
     image = graph.node("MatMul", graph.constant(f"{name}_down", down), image)

@@ -16,8 +16,8 @@ from typing import Protocol
 
 import numpy as np
 
-from kreps.arrays import Array, FloatArray, columns, like, namespace
-from kreps.linalg import principal_coordinates
+from kreps.arrays import Array, FloatArray, IntArray, columns, like, namespace
+from kreps.linalg import PivotedCholesky, pivoted_cholesky, principal_coordinates
 
 
 class Factor(Protocol):
@@ -66,13 +66,13 @@ class SmoothedImage:
 
     def coordinates(self, x: Array) -> Array:
         xp, n = namespace(x), x.shape[0]
-        down, across = (like(_smoothing(size), x) for size in self.shape)
+        down, across = (like(smoothing(size), x) for size in self.shape)
         smooth = down @ xp.reshape(columns(x, self.dims), (n, *self.shape)) @ across.T
         return xp.reshape(smooth, (n, down.shape[0] * across.shape[0]))
 
 
 @cache
-def _smoothing(size: int) -> FloatArray:
+def smoothing(size: int) -> FloatArray:
     """A matrix (k, size), k <= size, that gives rows of pixels the distances of smoothed ones.
 
     Smooth rows lie in few dimensions: only their coordinates there are kept.
@@ -143,23 +143,68 @@ class Kernel:
         return gaussian_gram(self.embed(x), None if y is None else self.embed(y))
 
 
+THIN = 32
+"""Coordinates up to which norms are worth a column of the matrix product."""
+
+PANEL = 65_536
+"""Numbers that are worked on at once: they fit the cache, so that memory is passed but once."""
+
+WIDEST = 4_096
+"""Columns of a panel at most."""
+
+
 def gaussian_gram(e: Array, f: Array | None = None) -> Array:
     """``exp(-|e_i - f_j|^2 / 2)`` for coordinates (n, m) and (k, m); ``f`` None means ``e``."""
     xp = namespace(e)
-    # Distances do not feel a common shift, but rounding does: centre first.  On e alone, so that
-    # what comes out for one f_j does not depend on the others.
+    # Distances do not feel a common shift, but rounding does: centre first.
     centre = xp.mean(e, axis=0)
     e = e - centre
-    f_centred = e if f is None else f - centre
-    k = e @ f_centred.T  # NumPy uses the symmetric product when both are one array
+    g = e if f is None else f - centre
+    if xp is np:
+        return _gram(e, g)
+    k = e @ g.T
     k -= 0.5 * xp.sum(e * e, axis=1)[:, None]
-    k -= 0.5 * xp.sum(f_centred * f_centred, axis=1)
-    if xp is not np:
-        return xp.exp(xp.clip(k, max=0.0))
-    np.minimum(k, 0.0, out=k)
-    if f is None:
-        np.fill_diagonal(k, 0.0)
-    return np.exp(k, out=k)
+    k -= 0.5 * xp.sum(g * g, axis=1)
+    return xp.exp(xp.clip(k, max=0.0))
+
+
+def _gram(e: FloatArray, f: FloatArray) -> FloatArray:
+    """`gaussian_gram` of NumPy's arrays, panel by panel: hardly slower than the exponentials."""
+    n, m = e.shape
+    # Half squares, larger by what rounding may do to the product: no exponent is ever positive.
+    half = -0.5 * (1.0 + (m + 6) * np.finfo(np.float64).eps)
+    left, right = (half * np.einsum("ij,ij->i", c, c)[:, None] for c in (e, f))
+    k = np.empty((n, len(f)))
+    if m <= THIN:
+        a = np.concatenate([e, left, np.ones_like(left)], axis=1)
+        b = np.concatenate([f, np.ones_like(right), right], axis=1).T
+    else:
+        np.matmul(e, f.T, out=k)  # the symmetric product if both are one array
+    wide = min(len(f), WIDEST)
+    tall = max(1, PANEL // max(1, wide))
+    for i in range(0, n, tall):
+        for j in range(0, len(f), wide):
+            rows, across = slice(i, i + tall), slice(j, j + wide)
+            panel = k[rows, across]
+            if m <= THIN:
+                np.matmul(a[rows], b[:, across], out=panel)
+            else:
+                panel += left[rows]
+                panel += right[across].T
+            np.exp(panel, out=panel)
+    if e is f:
+        np.fill_diagonal(k, 1.0)
+    return k
+
+
+def pivots_of(kernel: Kernel, x: FloatArray, *, tolerance: float, max_rank: int) -> PivotedCholesky:
+    """Pivoted Cholesky of the Gram matrix of inputs (n, d), which is never formed."""
+    e = kernel.embed(x)
+
+    def entries(rows: IntArray | None, across: IntArray) -> FloatArray:
+        return gaussian_gram(e[across], e if rows is None else e[rows]).T
+
+    return pivoted_cholesky(np.ones(len(e)), entries, tolerance=tolerance, max_rank=max_rank)
 
 
 def squared_distances(factor: Factor, x: FloatArray) -> FloatArray:

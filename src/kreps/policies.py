@@ -11,12 +11,11 @@ import numpy as np
 from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
 from kreps.errors import ConfigurationError
-from kreps.kernels import Kernel
+from kreps.kernels import Kernel, pivots_of
 from kreps.linalg import (
     Cholesky,
     cholesky,
     inverse_lower,
-    pivoted_cholesky,
     qr_factor,
     solve_lower,
     solve_lower_transposed,
@@ -133,12 +132,7 @@ class CostSensitiveGP:
         r^2 instead of m^2.
         """
         kernel, states = self.kernel, self.states
-        chosen = pivoted_cholesky(
-            np.ones(len(states)),
-            lambda rows: kernel.gram(states, states[rows]),
-            tolerance=PIVOT_TOLERANCE,
-            max_rank=len(states) // 2,
-        )
+        chosen = pivots_of(kernel, states, tolerance=PIVOT_TOLERANCE, max_rank=len(states) // 2)
         if chosen.residual > PIVOT_TOLERANCE:  # not so smooth: all support points are pivots
             centres = states
             mean_weights = self.signal * self.alpha

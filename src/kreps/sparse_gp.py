@@ -128,8 +128,8 @@ class SparseGP:
     def _covariances(self, states: FloatArray) -> FloatArray:
         """Kernel values (r, m) of the centres with states (m, ds).
 
-        As `gaussian_gram` of both, to the last bit, but what depends on the centres alone is not
-        computed again in each cycle.
+        As `gaussian_gram` of both, but what depends on the centres alone is not computed again
+        in each cycle.
         """
         origin, centred, half_squares = self._centred
         f = self.kernel.embed(states) - origin

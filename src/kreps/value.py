@@ -13,8 +13,8 @@ import numpy as np
 
 from kreps.arrays import Array, FloatArray, like, namespace
 from kreps.errors import ConfigurationError
-from kreps.kernels import Factor, Kernel, Periodic
-from kreps.linalg import cholesky, pivoted_cholesky, solve_lower, solve_lower_transposed
+from kreps.kernels import Factor, Kernel, Periodic, pivots_of
+from kreps.linalg import cholesky, solve_lower, solve_lower_transposed
 
 MAX_CENTRES = 4096
 """Most centres of a grid: the dual costs their cube."""
@@ -86,12 +86,7 @@ class RKHSBasis:
         cls, kernel: Kernel, points: FloatArray, *, tolerance: float, max_rank: int
     ) -> tuple[RKHSBasis, FloatArray]:
         """The basis, and the features (m, r) of the ``points`` (m, ds) that it was chosen from."""
-        chosen = pivoted_cholesky(
-            np.ones(len(points)),
-            lambda rows: kernel.gram(points, points[rows]),
-            tolerance=tolerance,
-            max_rank=max_rank,
-        )
+        chosen = pivots_of(kernel, points, tolerance=tolerance, max_rank=max_rank)
         lower = np.asfortranarray(np.tril(chosen.columns[chosen.pivots]))
         basis = cls(kernel, points[chosen.pivots], lower, chosen.residual)
         return basis, chosen.columns

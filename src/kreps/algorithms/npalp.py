@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import spsolve
-from scipy.spatial.distance import cdist
 
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import state_kernel
@@ -72,6 +71,8 @@ def update(
     Raises:
         DataError: no roll-outs at all, or some of another width than the task's.
     """
+    from scipy.spatial.distance import cdist  # 0.1 s that other methods need not wait
+
     window, data = state.extended(rollouts, task)
     clock = Stopwatch()
     kernel = state_kernel(data, task, rng)
