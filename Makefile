@@ -2,7 +2,6 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
-LARGEST ?= 10000
 
 .PHONY: demo test check bench format clean constraints tables
 
@@ -20,7 +19,7 @@ check: .venv/installed          ## formatter, linter, types, floors
 	$(BIN)/lint-imports
 
 bench: .venv/installed          ## speed against the machine's own peak, to results/benchmarks.md
-	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --record=results --largest=$(LARGEST)
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --record=results
 
 format: .venv/installed
 	$(BIN)/ruff format .
@@ -34,7 +33,7 @@ format: .venv/installed
 	touch $@
 
 constraints:                    ## renew constraints.txt (needs uv)
-	uv pip compile pyproject.toml --extra dev --universal --generate-hashes \
+	uv pip compile pyproject.toml --extra dev --extra bench --universal --generate-hashes \
 	  --no-annotate --no-header --upgrade --quiet -o constraints.txt
 
 tables:                         ## write the tables of results/ into the pages that show them

@@ -18,7 +18,6 @@ DONE: list[Measured] = []
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--record", type=Path, help="folder to write benchmarks.json and .md into")
-    parser.addoption("--largest", type=int, default=10_000, help="most samples of an update")
 
 
 @pytest.fixture(scope="module", autouse=True)

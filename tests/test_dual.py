@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import reduce
+from operator import add
 
 import numpy as np
 import pytest
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
-from kreps.arrays import FloatArray
+from kreps.arrays import FloatArray, IntArray
 from kreps.dual import (
     DECREMENT_TOLERANCE,
     GAP_TOLERANCE,
     KL_TOLERANCE,
     DualProblem,
     DualSolution,
+    Moments,
     Outcome,
     bellman_errors,
     dual_gradient,
@@ -529,3 +532,141 @@ def test_rewards_that_move_with_a_potential_do_not_change_the_weights() -> None:
     problem = random_problem(7, ridge=1e-10)
     shaped = replace(problem, rewards=problem.rewards + problem.differences @ np.linspace(-1, 1, 7))
     np.testing.assert_allclose(solve_dual(shaped).weights, solve_dual(problem).weights, atol=1e-5)
+
+
+# Chunks of samples
+
+
+@dataclass(frozen=True)
+class InPieces(DualProblem):
+    """The same problem, but its moments are added up over pieces of the samples."""
+
+    pieces: tuple[IntArray, ...]
+
+    @classmethod
+    def of(cls, problem: DualProblem, pieces: list[IntArray]) -> InPieces:
+        return cls(
+            problem.rewards,
+            problem.differences,
+            problem.kl_bound,
+            problem.ridge,
+            problem.eta_floor,
+            tuple(pieces),
+        )
+
+    def moments(self, eta: float, theta: FloatArray, *, scatter: bool) -> Moments:
+        delta = self.bellman_errors(theta)
+        parts = [
+            Moments.of(delta[rows], self.differences[rows], eta, scatter=scatter)
+            for rows in self.pieces
+        ]
+        return reduce(add, parts)
+
+
+def cut(samples: int, cuts: list[int], order: int) -> list[IntArray]:
+    """Pieces between the cuts, forwards, backwards or shuffled."""
+    pieces = np.split(np.arange(samples), cuts)
+    if order < 0:
+        return pieces[::-1]
+    shuffled = np.random.default_rng(order).permutation(len(pieces))
+    return pieces if order == 0 else [pieces[i] for i in shuffled]
+
+
+def assert_same_dual(
+    pieces: DualProblem, whole: DualProblem, eta: float, theta: FloatArray
+) -> None:
+    """Value, gradient and Hessian agree to rounding, each relative to its largest entry."""
+    value, (g_eta, g_theta) = dual_value(whole, eta, theta), dual_gradient(whole, eta, theta)
+    hessian = dual_hessian(whole, eta, theta)
+    assert dual_value(pieces, eta, theta) == pytest.approx(value, rel=1e-11)
+    found_eta, found_theta = dual_gradient(pieces, eta, theta)
+    assert found_eta == pytest.approx(g_eta, rel=1e-10, abs=1e-10)
+    np.testing.assert_allclose(found_theta, g_theta, rtol=0.0, atol=1e-10 * np.abs(g_theta).max())
+    np.testing.assert_allclose(
+        dual_hessian(pieces, eta, theta), hessian, rtol=0.0, atol=1e-10 * np.abs(hessian).max()
+    )
+
+
+@pytest.mark.parametrize("order", [0, -1, 1, 2])
+@pytest.mark.parametrize("cuts", [[40], [1], [79], [13, 14, 60], list(range(1, 80))])
+def test_moments_of_chunks_add_up_to_those_of_all_samples(cuts: list[int], order: int) -> None:
+    problem = random_problem(80)
+    theta = np.random.default_rng(81).normal(size=7)
+    assert_same_dual(InPieces.of(problem, cut(80, cuts, order)), problem, 0.4, theta)
+
+
+@pytest.mark.parametrize("order", [0, -1, 1])
+@pytest.mark.parametrize("apart", [0.3, 3.0, 30.0, 1e4])
+def test_chunks_far_below_the_others_neither_overflow_nor_count(apart: float, order: int) -> None:
+    # At eta = 0.1 a chunk that is 1e4 lower weighs exp(-1e5): nothing, but not NaN either.
+    problem = random_problem(82)
+    lower = np.repeat([1.0, 0.0, 2.0, 0.0], 20) * apart
+    problem = replace(problem, rewards=problem.rewards - lower)
+    pieces = InPieces.of(problem, cut(80, [20, 40, 60], order))
+    theta = 0.3 * np.random.default_rng(83).normal(size=7)
+    assert_same_dual(pieces, problem, 0.1, theta)
+    assert dual_value(pieces, 0.1, theta) == pytest.approx(
+        value_by_the_book(problem, 0.1, theta), rel=1e-11
+    )
+
+
+@pytest.mark.parametrize("eta", [0.02, 0.5, 20.0])
+def test_the_kl_of_moments_is_that_of_the_weights(eta: float) -> None:
+    problem = random_problem(84)
+    theta = np.random.default_rng(85).normal(size=7)
+    delta = bellman_errors(problem, theta)
+    wanted = kl_from_uniform(sample_weights(delta, eta))
+    halves = InPieces.of(problem, cut(80, [33], 0))
+    for each in (problem, halves):
+        found = each.moments(eta, theta, scatter=False)
+        assert found.samples == 80
+        assert found.kl == pytest.approx(wanted, rel=1e-10, abs=1e-12)
+        assert found.soft_maximum == pytest.approx(
+            eta * (logsumexp(delta / eta) - np.log(80)), rel=1e-11
+        )
+
+
+def test_a_covariance_is_made_only_where_it_is_asked_for() -> None:
+    pieces = InPieces.of(random_problem(86), cut(80, [10], 0))
+    assert pieces.moments(1.0, np.zeros(7), scatter=False).scatter is None
+    scatter = pieces.moments(1.0, np.zeros(7), scatter=True).scatter
+    assert scatter is not None and scatter.shape == (8, 8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_problem_in_pieces_has_the_solution_of_the_whole(seed: int) -> None:
+    problem = random_problem(seed)
+    pieces = InPieces.of(problem, cut(80, [1, 30, 70], -1))
+    whole, found = solve_dual(problem), solve_dual(pieces)
+    assert_optimal(pieces, found)
+    assert found.iterations == whole.iterations
+    np.testing.assert_allclose(found.weights, whole.weights, rtol=1e-8)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_solution_does_not_depend_on_where_the_solver_starts(seed: int) -> None:
+    problem = random_problem(seed)
+    cold = solve_dual(problem)
+    half = replace(
+        problem,
+        rewards=problem.rewards[::2],
+        differences=np.ascontiguousarray(problem.differences[::2]),
+    )
+    near = solve_dual(half)
+    far = np.random.default_rng(seed).normal(size=7)
+    for start in [(near.eta, near.theta), (30.0, np.zeros(7)), (0.2, far)]:
+        found = solve_dual(problem, start=start)
+        assert_optimal(problem, found)
+        # What the tolerance of the KL bound leaves open; measured: up to 4e-5.
+        np.testing.assert_allclose(found.weights, cold.weights, atol=1e-4 * cold.weights.max())
+    assert solve_dual(problem, start=(cold.eta, cold.theta)).iterations == 0
+
+
+def test_the_floor_is_found_from_a_start_at_it_and_from_far_above_it() -> None:
+    problem = floor_problem(0)
+    cold = solve_dual(problem)
+    for start in [(cold.eta, cold.theta), (problem.eta_floor, 0.0 * cold.theta), (9.0, cold.theta)]:
+        found = solve_dual(problem, start=start)
+        assert found.outcome is Outcome.AT_FLOOR
+        assert_optimal(problem, found)
+        np.testing.assert_allclose(found.weights, cold.weights, atol=1e-5)

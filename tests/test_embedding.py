@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from functools import reduce
+from operator import add
+
 import numpy as np
 import pytest
 
 from kreps.arrays import FloatArray
-from kreps.embedding import KernelEmbedding, SampleModel
+from kreps.embedding import FeatureRegression, KernelEmbedding, RegressionSums, SampleModel
 from kreps.kernels import Kernel, Periodic, SquaredExponential, factors_of
+from kreps.value import Basis, FourierBasis, RKHSBasis
 
 
 def fitted(n: int, seed: int, regulariser: float) -> tuple[KernelEmbedding, FloatArray]:
@@ -98,3 +102,64 @@ def test_the_conditional_expectation_is_learnt_from_noisy_successors() -> None:
     assert few[0] > 2.0 * some[0] > 4.0 * many[0]
     assert few[1] > 2.0 * some[1] > 4.0 * many[1]
     assert many[0] < 0.1 * many[2]
+
+
+# In features of states and actions
+
+
+@pytest.mark.parametrize("regulariser", [1e-2, 1.0])
+@pytest.mark.parametrize("way", ["pivoted", "uniform"])
+def test_regression_on_all_features_is_the_kernel_embedding(way: str, regulariser: float) -> None:
+    model, successors = fitted(60, 7, regulariser)
+    if way == "pivoted":
+        basis, _ = RKHSBasis.fit(model.kernel, model.inputs, tolerance=1e-14, max_rank=60)
+    else:
+        rng = np.random.default_rng(8)
+        basis = RKHSBasis.uniform(model.kernel, model.inputs, max_rank=60, rng=rng)
+    sums = RegressionSums.of(basis.features(model.inputs), successors)
+    found = FeatureRegression.fit(basis, sums, regulariser)
+    assert found.jitter == 0.0
+    # The condition of K + lambda I, up to 1e4, takes that many digits.
+    np.testing.assert_allclose(
+        found.mean(model.inputs), model.expected_features(successors), atol=1e-8
+    )
+    queries = np.random.default_rng(9).normal(size=(7, 3))
+    wanted = model.strengths(queries).T @ successors
+    np.testing.assert_allclose(found.mean(queries), wanted, atol=1e-8)
+
+
+def test_regression_on_few_features_is_the_embedding_of_their_kernel() -> None:
+    model, successors = fitted(50, 10, 0.05)
+    pivoted, _ = RKHSBasis.fit(model.kernel, model.inputs, tolerance=1e-3, max_rank=12)
+    rng = np.random.default_rng(11)
+    bases: list[Basis] = [pivoted, FourierBasis.draw(model.kernel, 3, max_rank=12, rng=rng)]
+    for basis in bases:
+        psi = basis.features(model.inputs)
+        assert psi.shape == (50, 12)
+        k = psi @ psi.T
+        wanted = k @ np.linalg.solve(k + 0.05 * np.eye(50), successors)
+        found = FeatureRegression.fit(basis, RegressionSums.of(psi, successors), 0.05)
+        np.testing.assert_allclose(found.mean(model.inputs), wanted, atol=1e-10)
+
+
+@pytest.mark.parametrize("cuts", [[20], [1, 2, 39]])
+def test_what_chunks_say_of_the_embedding_adds_up(cuts: list[int]) -> None:
+    rng = np.random.default_rng(12)
+    psi, targets = rng.normal(size=(40, 5)), rng.normal(size=(40, 3))
+    whole = RegressionSums.of(psi, targets)
+    np.testing.assert_allclose(whole.gram, psi.T @ psi, rtol=1e-13)
+    np.testing.assert_allclose(whole.product, psi.T @ targets, rtol=1e-13)
+    chunks = zip(np.split(psi, cuts), np.split(targets, cuts), strict=True)
+    added = reduce(add, (RegressionSums.of(*chunk) for chunk in chunks))
+    np.testing.assert_allclose(added.gram, whole.gram, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(added.product, whole.product, rtol=1e-12, atol=1e-13)
+
+
+def test_duplicated_inputs_are_regressed_on_without_harm() -> None:
+    # All features but one vanish, so that only the regulariser keeps the system solvable.
+    kernel = Kernel(factors_of(1), np.array([1.0]))
+    basis = RKHSBasis.uniform(kernel, np.zeros((4, 1)), max_rank=4, rng=np.random.default_rng(13))
+    targets = np.array([[0.0], [2.0], [4.0], [6.0]])
+    sums = RegressionSums.of(basis.features(np.zeros((4, 1))), targets)
+    found = FeatureRegression.fit(basis, sums, 1e-6)
+    np.testing.assert_allclose(found.mean(np.zeros((1, 1))), 3.0, rtol=1e-5)

@@ -48,7 +48,7 @@ def as_numpy(array: Array) -> FloatArray:
         return array.cpu().numpy()
     if array_api_compat.is_cupy_array(array):
         return array.get()
-    return np.from_dlpack(array, device="cpu")
+    return as_float(np.from_dlpack(array, device="cpu"))
 
 
 def columns(array: Array, chosen: Sequence[int]) -> Array:

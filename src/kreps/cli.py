@@ -359,10 +359,12 @@ def main() -> None:
 
 
 def _setting(text: str) -> tuple[str, Any]:
-    """``name=value``; the value is read as JSON where it can be."""
+    """``name=value``; the value is read as JSON where it can be, and None as in Python."""
     name, equals, value = text.partition("=")
     if not equals:
         raise ConfigurationError(f"--set {text!r} is not NAME=VALUE, such as kl_bound=0.5")
+    if value == "None":
+        return name, None
     try:
         return name, json.loads(value)
     except ValueError:

@@ -90,10 +90,23 @@ class Dataset:
 
     @classmethod
     def of(cls, rollouts: Iterable[Rollout]) -> Dataset:
-        """Roll-outs in memory."""
+        """Roll-outs in memory.
+
+        Raises:
+            DataError: none, something that is no roll-out, or different widths.
+        """
         groups: list[list[Rollout]] = []
-        size = CHUNK
-        for rollout in rollouts:
+        size, widths = CHUNK, None
+        for number, rollout in enumerate(rollouts):
+            if not isinstance(rollout, Rollout):
+                raise DataError(f"item {number} is a {type(rollout).__name__}, not a kreps.Rollout")
+            found = rollout.observations.shape[1], rollout.actions.shape[1]
+            widths = widths or found
+            if found != widths:
+                raise DataError(
+                    f"roll-out {number} has (observation, action) coordinates {found}, those "
+                    f"before it {widths}; make a data set of each task's"
+                )
             if size >= CHUNK:
                 groups.append([])
                 size = 0
@@ -122,11 +135,14 @@ class Dataset:
         Raises:
             DataError: sizes that do not fit together.
         """
-        steps = np.asarray(lengths, dtype=np.intp)
+        given = np.asarray(lengths)
+        steps = given.astype(np.intp)
         ended = np.zeros(len(steps), bool) if terminated is None else np.asarray(terminated, bool)
         n = len(rewards)
         fits = (
             (observations.ndim, actions.ndim, rewards.ndim) == (2, 2, 1)
+            and steps.ndim == 1
+            and (steps == given).all()
             and (steps >= 1).all()
             and steps.sum() == n == len(actions)
             and len(observations) == n + len(steps)
@@ -138,6 +154,8 @@ class Dataset:
                 f"{rewards.shape} and {len(steps)} lengths that add up to {steps.sum()} do not fit "
                 "together: R roll-outs of n steps in all need (n + R, ds), (n, da), (n,) and (R,)"
             )
+        if n == 0:
+            return cls(())
         ends = np.cumsum(steps)
         # a new chunk begins with the roll-out in which another CHUNK samples are full
         cuts = np.flatnonzero(np.diff((ends - steps) // CHUNK, prepend=-1))

@@ -180,8 +180,8 @@ def _gram(e: FloatArray, f: FloatArray) -> FloatArray:
         b = np.concatenate([f, np.ones_like(right), right], axis=1).T
     else:
         np.matmul(e, f.T, out=k)  # the symmetric product if both are one array
-    wide = min(len(f), WIDEST)
-    tall = max(1, PANEL // max(1, wide))
+    wide = max(1, min(len(f), WIDEST))
+    tall = PANEL // wide
     for i in range(0, n, tall):
         for j in range(0, len(f), wide):
             rows, across = slice(i, i + tall), slice(j, j + wide)

@@ -227,6 +227,11 @@ class Learner(Generic[MethodSettings]):
         """
         if isinstance(rollouts, Rollout):
             raise DataError("update() takes a list of roll-outs; write update([rollout])")
+        if isinstance(rollouts, Dataset):
+            raise DataError(
+                f"{type(self).__name__} learns from all samples at once and takes a list of "
+                "roll-outs; only KREPS learns from a data set"
+            )
         rollouts = list(rollouts)
         for number, rollout in enumerate(rollouts):
             if not isinstance(rollout, Rollout):

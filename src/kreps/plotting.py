@@ -19,6 +19,7 @@ from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
 from kreps.errors import ConfigurationError, StorageError
 from kreps.policies import CostSensitiveGP
+from kreps.sparse_gp import SparseGP
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -129,12 +130,12 @@ def policy_maps(
     Raises:
         ConfigurationError: the state space has not two dimensions.
     """
-    assert isinstance(state.policy, CostSensitiveGP) and state.value is not None
+    assert isinstance(state.policy, CostSensitiveGP | SparseGP) and state.value is not None
     axes_x, axes_y, states = _grid(state, task)
     low, high = task.action_low[0], task.action_high[0]
     spread = state.policy.standard_deviation(states)[:, 0]
     panels = (
-        ("Policy mean", np.clip(state.policy.mean(states)[:, 0], low, high), "RdBu_r", low, high),
+        ("Policy mean", np.clip(state.policy.greedy(states)[:, 0], low, high), "RdBu_r", low, high),
         ("Policy standard deviation", spread, "viridis", 0.0, None),
         ("Value function V", state.value(states), "magma", None, None),
     )

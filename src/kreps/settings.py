@@ -31,7 +31,8 @@ class LearnerSettings:
     def __post_init__(self) -> None:
         self._check("restart_probability", Real, "in (0, 1)", lambda v: 0 < v < 1)
         if self.window is not None:
-            self._whole("window")
+            whole = "a whole number >= 1, or None to keep all"
+            self._check("window", Integral, whole, lambda v: v >= 1)
 
     def _choose(self, name: str, kind: Any) -> None:
         if getattr(self, name) not in get_args(kind):

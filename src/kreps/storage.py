@@ -568,7 +568,7 @@ def rollout_folder(path: str | Path) -> Dataset:
     Raises:
         StorageError: no such folder, or a file in it that is damaged or foreign.
     """
-    folder = Path(path)
+    folder = Path(path).resolve()  # workers may stand in another one
     if not folder.is_dir():
         raise StorageError(f"{folder} is not a folder; check the path")
     files = sorted(folder.glob("*.safetensors"))
@@ -660,7 +660,8 @@ def load_checkpoint(
             raise StorageError(f"seed and counts {counts} are not all whole numbers >= 0")
         seed, iteration, rollouts_seen, steps = counts
         window = Window(settings.window)
-        if iteration > 0 or "window.lengths" in tensors:
+        # a learner that has seen nothing but data sets has no roll-outs
+        if ROLLOUT_ARRAYS & tensors.keys() or (iteration > 0 and method != "reps"):
             rollouts = _rollouts_of(tensors, task.observation_size, task.action_size)
             window = window.extend(rollouts)
         learnt, g = iteration > 0, task.factor_count

@@ -80,6 +80,7 @@ class RKHSBasis:
     pivots: FloatArray
     lower: FloatArray
     residual: float
+    jitter: float = 0.0
 
     @classmethod
     def fit(
@@ -97,7 +98,8 @@ class RKHSBasis:
     ) -> RKHSBasis:
         """The same with pivots drawn at random among the ``points`` (m, ds): Nystroem's way."""
         rows = np.sort(rng.choice(len(points), min(max_rank, len(points)), replace=False))
-        basis = cls(kernel, points[rows], cholesky(kernel.gram(points[rows])).lower, 0.0)
+        factor = cholesky(kernel.gram(points[rows]))
+        basis = cls(kernel, points[rows], factor.lower, 0.0, factor.jitter)
         features = basis.features(points)
         left = 1.0 - np.einsum("ij,ij->i", features, features)
         return replace(basis, residual=max(float(left.max()), 0.0))

@@ -44,6 +44,7 @@ from kreps.dataset import Dataset
 from kreps.dual import DualProblem, DualSolution, effective_sample_size, solve_dual, standardise
 from kreps.embedding import FeatureRegression
 from kreps.kernels import Kernel
+from kreps.policies import MAX_SUPPORT
 from kreps.settings import Settings
 from kreps.sparse_gp import SparseGP
 from kreps.value import Basis, FourierBasis, RBFGrid, RKHSBasis
@@ -103,6 +104,7 @@ def update(
     clock.lap("basis")
 
     # Eq. 4: the expected features of each successor, linear in features of state and action
+    bases = [basis]
     from_own = settings.model == "change"
     model, embedding_start = None, None
     if settings.model != "sample":
@@ -114,6 +116,7 @@ def update(
         )
         clock.lap("embedding fit")
         embedded = choose_basis(joint_kernel, inputs, settings, settings.rank, rng)
+        bases.append(embedded)
         says = EmbeddingSums(changes, embedded, task, from_own)
         sums = reduce(add, compute.map(says, dataset.chunks))
         model = FeatureRegression.fit(embedded, sums, regulariser)
@@ -143,7 +146,10 @@ def update(
     x = policy_hyperparameters(support, kernel, settings, state.policy_start, rng)
     clock.lap("policy fit")
     policy_kernel = kernel.with_lengthscales(np.exp(x[:-2]))
-    centres = choose_centres(policy_kernel, support.states, settings.rank, settings, rng)
+    centres = choose_centres(
+        policy_kernel, support.states, min(settings.rank, MAX_SUPPORT), settings, rng
+    )
+    bases.append(centres)
     says_of_policy = ChunkPolicySums(centres, task, place)
     said = reduce(add, compute.map(says_of_policy, dataset.chunks, dataset.split(weights)))
     policy = SparseGP.fit(
@@ -173,7 +179,11 @@ def update(
         state_lengthscales=kernel.lengthscales,
         embedding_parameters=None if embedding_start is None else np.exp(embedding_start),
         policy_parameters=np.exp(x),
-        jitter=max(dual.jitter, 0.0 if model is None else model.jitter),
+        jitter=max(
+            dual.jitter,
+            0.0 if model is None else model.jitter,
+            *(chosen.jitter for chosen in bases if isinstance(chosen, RKHSBasis)),
+        ),
         seconds=clock.seconds,
     )
     return new_state, info
