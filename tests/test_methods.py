@@ -464,9 +464,10 @@ def optimum() -> float:
     return -P * cost * 0.75  # the mean square of a start state
 
 
-# Variant, and the largest share of the cost of doing nothing that the median over five seeds may
+# Variant, and the largest share of the cost of doing nothing that the median over nine seeds may
 # have after three iterations, without exploration.  The optimum has 0.166, the first policies 3.2
-# and more; measured medians are 0.20, 0.20, 0.24, 0.17, 0.17 and 0.53.
+# and more; measured medians are 0.20, 0.20, 0.24, 0.17, 0.17 and 0.53.  Nine seeds: single ones of
+# value iteration feel the last bits.
 VARIANTS: list[tuple[str, dict[str, Any], float]] = [
     ("reps", {}, 0.3),
     ("reps", {"model": "sample"}, 0.3),
@@ -484,7 +485,7 @@ def test_each_method_learns_a_linear_quadratic_problem(
     nothing, first = earned(Rest()), max(earned(BangBang(TASK)), earned(Gaussian(TASK, 1.0)))
     assert 3.0 * nothing > first
     greedy, stochastic = [], []
-    for seed in range(5):
+    for seed in range(9):
         learner = made(method, seed, 0.0, **changes)
         learner.learn(1 if method == GRID else 3, progress=False)
         policy = learner.policy.process

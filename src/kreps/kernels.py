@@ -202,6 +202,8 @@ def pivots_of(kernel: Kernel, x: FloatArray, *, tolerance: float, max_rank: int)
     e = kernel.embed(x)
 
     def entries(rows: IntArray | None, across: IntArray) -> FloatArray:
+        if rows is across:  # symmetric, with ones on its diagonal
+            return gaussian_gram(e[across])
         return gaussian_gram(e[across], e if rows is None else e[rows]).T
 
     return pivoted_cholesky(np.ones(len(e)), entries, tolerance=tolerance, max_rank=max_rank)
