@@ -92,12 +92,10 @@ METHODS: dict[str, Method] = {
     DEFAULT: Method("reps", tuned=False),
     PAPER: Method("reps", {"recipe": "paper"}, tuned=False),
     IMAGES: Method("reps", {"recipe": "images"}, tuned=False),
-    LOW_RANK: Method("reps", {"approximation": "pivoted", "rank": 400}, tuned=False),
-    UNIFORM: Method("reps", {"approximation": "uniform", "rank": 400}, tuned=False),
-    FOURIER: Method("reps", {"approximation": "fourier", "rank": 400}, tuned=False),
-    LOW_RANK_IMAGES: Method(
-        "reps", {"recipe": "images", "approximation": "pivoted", "rank": 400}, tuned=False
-    ),
+    LOW_RANK: Method("reps", {"approximation": "pivoted"}, tuned=False),
+    UNIFORM: Method("reps", {"approximation": "uniform"}, tuned=False),
+    FOURIER: Method("reps", {"approximation": "fourier"}, tuned=False),
+    LOW_RANK_IMAGES: Method("reps", {"recipe": "images", "approximation": "pivoted"}, tuned=False),
     REMEMBERING: Method("reps", {"window": None}, tuned=False),
 }
 
