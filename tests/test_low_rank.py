@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -288,6 +289,31 @@ def test_the_dual_in_chunks_is_that_in_memory(
     assert found.eta == pytest.approx(wanted.eta, rel=1e-3)
     assert found.dual == pytest.approx(wanted.dual, abs=GAP_TOLERANCE)
     assert np.abs(found.weights - wanted.weights).sum() < 1e-3
+
+
+@pytest.mark.usefixtures("short_chunks")
+def test_the_dual_grows_from_part_to_part(
+    rollouts: list[Rollout], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each part is solved with the ridge of the next, and the next begins where it ended."""
+    monkeypatch.setattr(low_rank_reps, "SAMPLE", 40)
+    solved: list[tuple[Any, Any, DualSolution]] = []
+
+    def spy(problem: Any, *, start: Any = None) -> DualSolution:
+        solved.append((problem, start, solve_dual(problem, start=start)))
+        return solved[-1][2]
+
+    monkeypatch.setattr(low_rank_reps, "solve_dual", spy)
+    learner, info = updated(rollouts, approximation="pivoted", **LOW)
+    sizes = [len(problem.rewards) for problem, _, _ in solved]
+    assert sizes[0] == 40 and 40 < sizes[1] < 345 and sizes[2:] == [345]
+    ridges = [problem.ridge * size for (problem, _, _), size in zip(solved, sizes, strict=True)]
+    wanted = [learner.settings.ridge * size / min(4 * size, 345) for size in sizes]
+    np.testing.assert_allclose(ridges, wanted, rtol=1e-12)
+    for (_, _, before), (_, start, _) in itertools.pairwise(solved):
+        assert start == (before.eta, before.theta)
+    assert info.dual is solved[-1][2]
+    assert_certified(info, learner.settings.kl_bound)
 
 
 @pytest.mark.usefixtures("streamed")
