@@ -58,15 +58,15 @@ def one_by_one(e: FloatArray, rank: int) -> FloatArray:
 def bench_pivoted_cholesky(measure: Measure) -> None:
     e = np.random.default_rng(1).standard_normal((ROWS, 3))
 
-    def block_of(rows: IntArray) -> FloatArray:
-        return gaussian_gram(e, e[rows])
+    def entries(rows: IntArray | None, across: IntArray) -> FloatArray:
+        return gaussian_gram(e[across], e if rows is None else e[rows]).T
 
     kept: dict[str, FloatArray] = {}
 
     def blocked() -> None:
         kept.clear()
         found: PivotedCholesky = pivoted_cholesky(
-            np.ones(ROWS), block_of, tolerance=0.0, max_rank=RANK
+            np.ones(ROWS), entries, tolerance=0.0, max_rank=RANK
         )
         kept["blocked"] = found.columns
 

@@ -144,15 +144,6 @@ class Milliseconds99(_Limited):
         return 1e3 * float(np.median([np.percentile(block, 99) for block in blocks]))
 
 
-class Gigabytes(_Limited):
-    """Peak of the memory allocated."""
-
-    text = "GB of memory"
-
-    def value(self, times: Times) -> float:
-        return float("nan") if times.memory is None else times.memory / 1e9
-
-
 @dataclass(frozen=True)
 class Quality(_Limited):
     """A number that is no time: what the speed must not be bought with."""

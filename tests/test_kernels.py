@@ -18,6 +18,7 @@ from kreps.kernels import (
     factors_of,
     gaussian_gram,
     median_lengthscales,
+    pivots_of,
     squared_distances,
 )
 
@@ -222,3 +223,13 @@ def test_the_median_is_taken_over_a_random_sample_of_many_rows() -> None:
     assert found[0] == found[1] != found[2]
     # The median distance of two standard normals is 0.6745 sqrt 2.
     np.testing.assert_allclose(found, 0.954, rtol=0.15)
+
+
+def test_duplicated_rows_in_many_coordinates_do_not_enter_twice() -> None:
+    # Rounding grows with the coordinates: a diagonal that is a little less than one in whole
+    # columns, but one in small blocks, would leave residuals that are not there.
+    rng = np.random.default_rng(0)
+    x = np.repeat(rng.normal(size=(150, 60)), 2, axis=0)
+    kernel = Kernel((SquaredExponential(tuple(range(60))),), np.array([5.0]))
+    found = pivots_of(kernel, x, tolerance=1e-12, max_rank=300)
+    assert len(set((found.pivots // 2).tolist())) == len(found.pivots) <= 150

@@ -229,10 +229,14 @@ def export(
     policy = load_policy(file)
     if centres is not None:
         exact, policy = policy, policy.compressed(centres)
-        off = mean_difference(exact, policy)
-        say(f"compressed: at its samples the action is off by {off:.2g} of its scale (rms)")
-        if off > FAITHFUL:
-            say(f"that is more than {FAITHFUL:g}: take more centres, or evaluate it before its use")
+        if policy is not exact:
+            off = mean_difference(exact, policy)
+            say(f"compressed: at its samples the action is off by {off:.2g} of its scale (rms)")
+            if off > FAITHFUL:
+                say(
+                    f"that is more than {FAITHFUL:g}: take more centres, or evaluate it before "
+                    "its use"
+                )
     if out.suffix == ".onnx":
         arithmetic = policy.export_onnx(out, dtype)
         how = f"a model with {arithmetic} arithmetic"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Executor, Future
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
@@ -24,7 +24,8 @@ class Compute:
 
     Attributes:
         executor: any `concurrent.futures.Executor`, such as a process pool or a Dask client's
-            ``get_executor()``; None works in this process.  Each worker uses one BLAS thread.
+            ``get_executor()``; None works in this process.  Each worker process uses one BLAS
+            thread; a thread pool shares those of this process.
         to_device: makes the arrays that the work is done in, such as ``cupy.asarray``; must be
             picklable if there is an executor.  By default NumPy.
     """
@@ -37,13 +38,20 @@ class Compute:
         if self.executor is None:
             yield from map(function, *arguments)
             return
+        # threads share this process's BLAS, and would undo each other's limits
+        elsewhere = not isinstance(self.executor, ThreadPoolExecutor)
+        work = partial(_on_one_thread, function) if elsewhere else function
         pending: deque[Future[Result]] = deque()
-        for each in zip(*arguments, strict=True):
-            pending.append(self.executor.submit(partial(_on_one_thread, function), *each))
-            if len(pending) == AHEAD:
+        try:
+            for each in zip(*arguments, strict=True):
+                pending.append(self.executor.submit(work, *each))
+                if len(pending) == AHEAD:
+                    yield pending.popleft().result()
+            while pending:
                 yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
+        finally:
+            for future in pending:
+                future.cancel()
 
 
 def _on_one_thread(function: Callable[..., Result], *arguments: Any) -> Result:

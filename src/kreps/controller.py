@@ -86,7 +86,7 @@ class Policy:
         How much performance it costs is worth an evaluation: see ``benchmarks/predict.py``.
 
         Returns:
-            A policy with this one's seed, or this policy if it was compressed to as few before.
+            A policy with this one's seed, or this policy if it has no more centres.
 
         Raises:
             ConfigurationError: fewer than one centre, or a policy that has no samples to compress.
@@ -108,8 +108,8 @@ class Policy:
             raise ConfigurationError(_no_process(process, "compress"))
         if len(process.states) > count:
             raise ConfigurationError(
-                f"the policy was compressed to {len(process.states)} centres before, {count} were "
-                "asked for, and its samples are gone; compress the policy that it was made from"
+                f"the policy has {len(process.states)} centres and no samples any more, {count} "
+                f"were asked for; compress the exact policy, or learn with rank = {count}"
             )
         return self
 

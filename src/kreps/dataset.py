@@ -66,9 +66,10 @@ class ArrayChunk:
         ]
         for name, each in zip(("observations", "actions", "rewards"), values, strict=True):
             if not is_sane(each).all():
+                row = int(np.argwhere(~is_sane(each))[0, 0])
                 raise DataError(
-                    f"{name} hold NaN, an infinity or an absurdly large number; "
-                    "leave those roll-outs out"
+                    f"{name} hold NaN, an infinity or an absurdly large number, first in row {row} "
+                    f"of a chunk of {len(each)}; leave that roll-out out"
                 )
         points, actions, rewards = values
         start = np.concatenate([[0], ends[:-1] + np.arange(1, len(ends))])
@@ -95,6 +96,8 @@ class Dataset:
         Raises:
             DataError: none, something that is no roll-out, or different widths.
         """
+        if isinstance(rollouts, Rollout):
+            raise DataError("a data set has several roll-outs; write Dataset.of([rollout])")
         groups: list[list[Rollout]] = []
         size, widths = CHUNK, None
         for number, rollout in enumerate(rollouts):
@@ -135,9 +138,13 @@ class Dataset:
         Raises:
             DataError: sizes that do not fit together.
         """
-        given = np.asarray(lengths)
-        steps = given.astype(np.intp)
-        ended = np.zeros(len(steps), bool) if terminated is None else np.asarray(terminated, bool)
+        # as any array: a memory map stays one
+        observations, actions, rewards = map(np.asanyarray, (observations, actions, rewards))
+        given = np.atleast_1d(lengths)
+        steps = np.where(np.isfinite(given), given, 0).astype(np.intp)
+        ended = np.zeros(len(steps), bool)
+        if terminated is not None:
+            ended = np.atleast_1d(np.asarray(terminated, bool))
         n = len(rewards)
         fits = (
             (observations.ndim, actions.ndim, rewards.ndim) == (2, 2, 1)

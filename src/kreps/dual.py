@@ -47,7 +47,10 @@ class Problem(Protocol):
         ...
 
     def moments(self, eta: float, theta: FloatArray, *, scatter: bool) -> Moments:
-        """Of all rows of B and all Bellman errors."""
+        """Of all rows of B and all Bellman errors at temperature eta and theta (r,).
+
+        ``scatter`` says whether their covariance, the costly part, is needed.
+        """
         ...
 
 

@@ -171,8 +171,9 @@ def gaussian_gram(e: Array, f: Array | None = None) -> Array:
 def _gram(e: FloatArray, f: FloatArray) -> FloatArray:
     """`gaussian_gram` of NumPy's arrays, panel by panel: hardly slower than the exponentials."""
     n, m = e.shape
-    # Half squares, larger by what rounding may do to the product: no exponent is ever positive.
-    half = -0.5 * (1.0 + (m + 6) * np.finfo(np.float64).eps)
+    # In few coordinates half squares are larger by what rounding does to the product, so that no
+    # exponent is positive; in many that would be a bias, and exponents are clipped.
+    half = -0.5 * (1.0 + (m + 6) * np.finfo(np.float64).eps if m <= THIN else 1.0)
     left, right = (half * np.einsum("ij,ij->i", c, c)[:, None] for c in (e, f))
     k = np.empty((n, len(f)))
     if m <= THIN:
@@ -191,6 +192,7 @@ def _gram(e: FloatArray, f: FloatArray) -> FloatArray:
             else:
                 panel += left[rows]
                 panel += right[across].T
+                np.minimum(panel, 0.0, out=panel)
             np.exp(panel, out=panel)
     if e is f:
         np.fill_diagonal(k, 1.0)

@@ -333,7 +333,8 @@ class KREPS(OnPolicyLearner[Settings]):
         env, seed, periodic, threads: as of `Learner`.
         recipe: ``"default"``, ``"paper"`` (close to the printed method), ``"images"`` (for
             observations that are pictures) or a `kreps.Settings`.
-        compute: who works on the chunks of updates of low rank, and in which arrays.
+        compute: who works on the chunks of updates of low rank, and in which arrays; not part of a
+            checkpoint, so set it again after `resume`: ``learner.compute = ...``.
         **settings: any field of `kreps.Settings`, such as ``kl_bound``.
 
     Raises:
@@ -368,11 +369,13 @@ class KREPS(OnPolicyLearner[Settings]):
 
         Args:
             rollouts: at least one; their actions as commanded, before any clipping.  Or a
-                `kreps.Dataset` of any size, which is learnt from alone and not kept.
+                `kreps.Dataset` of any size, which is learnt from alone and not kept: later updates
+                see only the roll-outs that were given as such.
 
         Raises:
             DataError: not roll-outs, none of them, or of other widths than the task's.
             ConfigurationError: a data set with ``approximation="exact"``.
+            StorageError: a data set's file that is damaged, or not as it was when it was opened.
         """
         if not isinstance(rollouts, Dataset):
             return super().update(rollouts)

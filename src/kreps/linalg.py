@@ -193,7 +193,8 @@ def pivoted_cholesky(
     Args:
         diagonal: (n,) diagonal of K.
         entries: maps numbers of rows (a,), None for all, and columns (b,) to ``K[rows, columns]``.
-            Whole columns are best laid out one after the other (Fortran's order).
+            Whole columns are best laid out one after the other (Fortran's order).  Where rows and
+            columns are the same object the diagonal must be exact.
         tolerance: stop when the largest residual diagonal entry is below this.
         max_rank: stop at this many pivots.
         block: most pivots of a round.
@@ -212,7 +213,7 @@ def pivoted_cholesky(
             candidates = candidates[spread]
         known = columns[candidates, :rank]
         small = entries(candidates, candidates) - known @ known.T
-        # of rows that are worth the same but for rounding, the first: on whatever machine
+        # of rows that are worth the same but for rounding, the first
         first = small + np.diag(np.linspace(TIE * top, 0.0, len(small)))
         local, order, kept, _ = lapack.dpstrf(first, tol=tolerance, lower=1)
         if kept == 0:  # what seemed left of them was rounding

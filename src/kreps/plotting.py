@@ -128,8 +128,12 @@ def policy_maps(
     The latest roll-outs are drawn in: away from them the maps are extrapolation.
 
     Raises:
-        ConfigurationError: the state space has not two dimensions.
+        ConfigurationError: the state space has not two dimensions, or no roll-outs are kept.
     """
+    if not state.window.rollouts:
+        raise ConfigurationError(
+            "no roll-outs are kept to draw: all was learnt from data sets; update from some, too"
+        )
     assert isinstance(state.policy, CostSensitiveGP | SparseGP) and state.value is not None
     axes_x, axes_y, states = _grid(state, task)
     low, high = task.action_low[0], task.action_high[0]

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +23,7 @@ from kreps.algorithms.state import LearnerState
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window, is_sane
 from kreps.dataset import Dataset
-from kreps.errors import DataError, KrepsError, StorageError
+from kreps.errors import KrepsError, StorageError
 from kreps.kernels import Kernel
 from kreps.policies import MAX_SUPPORT, CostSensitiveGP, LearntPolicy
 from kreps.settings import AnySettings, LearnerSettings
@@ -510,21 +510,15 @@ def _rollouts_of(tensors: Tensors, ds: str | int, da: str | int) -> list[Rollout
 # ---- roll-outs --------------------------------------------------------------------------------
 
 
-def save_rollouts(rollouts: Sequence[Rollout], path: str | Path) -> None:
+def save_rollouts(rollouts: Iterable[Rollout], path: str | Path) -> None:
     """Write at least one roll-out to a file; read it back with `load_rollouts`.
 
     Raises:
-        DataError: no roll-out, or of different widths.
+        DataError: no roll-out, something else, or different widths.
         StorageError: the file cannot be written.
     """
-    if not rollouts:
-        raise DataError("there is no roll-out to write; give at least one")
-    widths = {(r.observations.shape[1], r.actions.shape[1]) for r in rollouts}
-    if len(widths) > 1:
-        raise DataError(
-            f"roll-outs of (observation, action) coordinates {sorted(widths)} do not belong in one "
-            "file; write those of each task to its own"
-        )
+    rollouts = list(rollouts) if not isinstance(rollouts, Rollout) else [rollouts]
+    Dataset.of(rollouts)  # complains
     samples = sum(len(r) for r in rollouts)
     write_arrays(Path(path), "rollouts", _rollout_parts(rollouts), {"samples": samples})
 

@@ -42,8 +42,8 @@ class ChunkRewards:
         wanted = self.task.observation_size, self.task.action_size
         if found != wanted:
             raise DataError(
-                f"a chunk has {found[0]} observation and {found[1]} action coordinates, "
-                f"the task {wanted[0]} and {wanted[1]}"
+                f"{getattr(chunk, 'path', 'a chunk')} has {found[0]} observation and {found[1]} "
+                f"action coordinates, the task {wanted[0]} and {wanted[1]}"
             )
         return data.rewards
 

@@ -99,8 +99,9 @@ def update(
     else:
         basis = choose_basis(kernel, sample.points, settings, settings.max_rank, rng)
     place = compute.to_device
-    *starts, count = reduce(add, compute.map(StartFeatures(basis, place), dataset.chunks))
-    changes = FeatureChanges(basis, np.array(starts) / count, place)
+    starts = reduce(add, compute.map(StartFeatures(basis, place), dataset.chunks))
+    count = int(starts[-1])
+    changes = FeatureChanges(basis, starts[:-1] / count, place)
     clock.lap("basis")
 
     # Eq. 4: the expected features of each successor, linear in features of state and action
@@ -161,7 +162,7 @@ def update(
         state,
         window=window,
         iteration=state.iteration + 1,
-        rollouts=state.rollouts + (int(count) if isinstance(rollouts, Dataset) else len(rollouts)),
+        rollouts=state.rollouts + (count if isinstance(rollouts, Dataset) else len(rollouts)),
         steps=state.steps + (n if isinstance(rollouts, Dataset) else sum(map(len, rollouts))),
         policy=policy,
         value=basis.function(reward_unit * dual.theta),

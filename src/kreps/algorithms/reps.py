@@ -61,7 +61,7 @@ class UpdateInfo:
             lambda, or sf2 and l.
         jitter: largest jitter that a factorisation of this update needed; trial points of the
             hyper-parameter searches do not count.
-        seconds: CPU seconds by stage.
+        seconds: CPU seconds of this process by stage.
     """
 
     samples: int
@@ -231,7 +231,7 @@ class PolicySamples:
         states: (m, ds).
         targets: (m, da) commanded actions around their centre, in units of the action scale.
         weights: (m,) ``p_i / sum p^2``: over all samples they add up to the effective sample size.
-        evidence: sum of the weights, those of samples that are not among these included.
+        evidence: sum of the weights of all samples kept, whether or not they are among these.
     """
 
     states: FloatArray

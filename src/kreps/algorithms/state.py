@@ -49,8 +49,8 @@ class LearnerState:
         if len(data) > MAX_SUPPORT:
             raise ConfigurationError(
                 f"{len(data)} samples are kept, but the exact update takes at most {MAX_SUPPORT}, "
-                f"as it costs their cube; keep fewer than {len(window.rollouts)} roll-outs: lower "
-                'window (or let KREPS approximate: approximation="auto")'
+                f"as it costs their cube; keep fewer than {len(window.rollouts)} roll-outs: set a "
+                'smaller window (or let KREPS approximate: approximation="auto")'
             )
         return window, data
 
