@@ -313,17 +313,23 @@ def comparison(
         source: command and commit that made it, printed below.
     """
     methods = list(dict.fromkeys(row["method"] for row in rows))
+    across = min(len(methods), 4)
+    deep = -(-len(methods) // across)
     with rc_context(STYLE):
-        figure = Figure(figsize=(4.6 * len(methods) + 1.4, 6.4))
+        figure = Figure(figsize=(4.6 * across + 1.4, 6.4 * deep))
         one_task = all(references[m] == references[methods[0]] for m in methods)
-        plots = figure.subplots(
-            2, len(methods), sharex=True, sharey=True if one_task else "col", squeeze=False
-        )
-        for column, method in enumerate(methods):
+        plots = figure.subplots(2 * deep, across, sharex=True, sharey=one_task, squeeze=False)
+        for axes in plots[-2:, len(methods) - across * (deep - 1) :].flat:
+            axes.set_axis_off()
+        for number, method in enumerate(methods):
             mine = [row for row in rows if row["method"] == method]
-            for axes, name in zip(plots[:, column], ("stochastic", "greedy"), strict=True):
+            row, column = divmod(number, across)
+            pair = plots[2 * row : 2 * row + 2, column]
+            if not one_task:
+                pair[0].sharey(pair[1])
+            for axes, name in zip(pair, ("stochastic", "greedy"), strict=True):
                 _draw_seeds(axes, mine, name)
-                named = not one_task or column == len(methods) - 1
+                named = not one_task or column == across - 1 or method == methods[-1]
                 draw_references(axes, references[method], named=named)
                 axes.set_title(f"{method}: {name}")
         for axes in plots[:, 0]:
