@@ -3,6 +3,7 @@
 python benchmarks/low_rank.py accuracy    # error of one update against the exact one, by rank
 python benchmarks/low_rank.py variance    # what each policy says far from its data
 python benchmarks/low_rank.py scale       # CPU time and memory for 10^4 to 10^6 samples
+    python benchmarks/low_rank.py growth      # CPU time by rank, and by the size of observations
 """
 
 from __future__ import annotations
@@ -279,6 +280,78 @@ def scale(out: Path, largest: int) -> None:
     write(out, "scale", content, figure, table)
 
 
+# ---- growth -----------------------------------------------------------------------------------
+
+DIMENSIONS = (2, 8, 32, 128, 512)
+BASES = (100, 200, 400, 800, 1600)
+
+
+def walks(dimension: int, n: int = 20_000, steps: int = 50) -> list[kreps.Rollout]:
+    """Random walks pushed by one action, paid for staying near zero."""
+    rng = np.random.default_rng(dimension)
+    found = []
+    for _ in range(n // steps):
+        actions = rng.uniform(-1.0, 1.0, (steps, 1))
+        moves = 0.3 * rng.standard_normal((steps + 1, dimension))
+        moves[1:, :1] += actions
+        states = np.cumsum(moves, axis=0) / np.sqrt(dimension)
+        rewards = -np.sum(states[:-1] ** 2, axis=1)
+        found.append(kreps.Rollout(states, actions, rewards))
+    return found
+
+
+def seconds_of_update(dimension: int, rank: int) -> dict[str, Any]:
+    task = kreps.TaskSpec(dimension, [-1.0], [1.0], groups=(tuple(range(dimension)),))
+    learner = kreps.KREPS(task, window=None, approximation="uniform", rank=rank, max_rank=rank)
+    rollouts = walks(dimension)
+    started = time.process_time()
+    info = learner.update(rollouts)
+    seconds = time.process_time() - started
+    return {
+        "dimension": dimension,
+        "rank": rank,
+        "cpu_seconds": seconds,
+        "newton_iterations": info.dual.iterations,
+        "stages": info.seconds,
+    }
+
+
+def growth(out: Path) -> None:
+    by_rank = [seconds_of_update(2, rank) for rank in BASES]
+    by_dimension = [seconds_of_update(dimension, 200) for dimension in DIMENSIONS]
+    with rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 3.2), layout="constrained")
+        panels = zip(
+            figure.subplots(1, 2), ("rank", "dimension"), (by_rank, by_dimension), strict=True
+        )
+        for axis, name, rows in panels:
+            x = [row[name] for row in rows]
+            whole = [row["cpu_seconds"] for row in rows]
+            fits = [row["stages"]["embedding fit"] + row["stages"]["policy fit"] for row in rows]
+            axis.loglog(x, whole, "o-", color=BLUE, ms=3, label="whole update")
+            axis.loglog(x, fits, "o--", color=GREY, ms=3, label="of it hyper-parameters")
+            axis.set_xticks(x, [str(value) for value in x])
+            axis.minorticks_off()
+        left, right = figure.axes
+        left.set_xlabel("rank of every basis (2 coordinates)")
+        right.set_xlabel("coordinates of an observation (rank 200)")
+        left.set_ylabel("CPU seconds, n = 20,000")
+        left.legend(frameon=False)
+    table = markdown(
+        ["coordinates", "rank", "CPU s", "Newton iterations"],
+        [
+            [
+                str(row["dimension"]),
+                str(row["rank"]),
+                f"{row['cpu_seconds']:.1f}",
+                str(row["newton_iterations"]),
+            ]
+            for row in (*by_rank, *by_dimension)
+        ],
+    )
+    write(out, "growth", {"by_rank": by_rank, "by_dimension": by_dimension}, figure, table)
+
+
 def kreps_threads() -> Any:
     from kreps.threads import blas_threads
 
@@ -289,7 +362,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("what", choices=["accuracy", "variance", "scale"])
+    parser.add_argument("what", choices=["accuracy", "variance", "scale", "growth"])
     parser.add_argument("--out", type=Path, default=Path("results"))
     parser.add_argument("--largest", type=int, default=SIZES[-1], help="of the sizes of scale")
     asked = parser.parse_args()
@@ -297,6 +370,7 @@ def main() -> None:
         "accuracy": lambda: accuracy(asked.out),
         "variance": lambda: variance(asked.out),
         "scale": lambda: scale(asked.out, asked.largest),
+        "growth": lambda: growth(asked.out),
     }
     work[asked.what]()
 
