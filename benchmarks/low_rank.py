@@ -235,14 +235,23 @@ def scale(out: Path, largest: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         make_data(folder, sizes[-1])
-        for n in sizes:
-            for variant, (options, wanted) in VARIANTS.items():
-                if n not in wanted:
-                    continue
-                with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as fresh:
-                    row = fresh.submit(one_size, folder, n, options).result()
-                found[variant].append(row)
-                print(variant, row, flush=True)
+        work = [
+            (n, variant, options)
+            for variant, (options, wanted) in VARIANTS.items()
+            for n in sizes
+            if n in wanted
+        ]
+        work.sort(key=lambda each: (-each[0], -len(each[2])))  # the longest first
+        with ProcessPoolExecutor(
+            2, mp_context=get_context("spawn"), max_tasks_per_child=1
+        ) as fresh:
+            running = [
+                (variant, fresh.submit(one_size, folder, n, options))
+                for n, variant, options in work
+            ]
+            for variant, row in running:
+                found[variant].insert(0, row.result())
+                print(variant, row.result(), flush=True)
     slopes = {}
     with rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.2), layout="constrained")

@@ -202,9 +202,7 @@ def test_compressing_leaves_the_policy_as_it_was() -> None:
 def test_a_compressed_policy_is_compressed_already() -> None:
     few = Policy(fit(*samples(60, 33))).compressed(10)
     assert few.compressed(10) is few and few.compressed(11) is few
-    with pytest.raises(
-        ConfigurationError, match=r"10 centres and no samples.*rank = 9"
-    ):
+    with pytest.raises(ConfigurationError, match=r"10 centres and no samples.*rank = 9"):
         few.compressed(9)
 
 

@@ -318,9 +318,6 @@ GAP_TOLERANCE = 1e-6
 KL_TOLERANCE = 1e-4  # relative to the bound
 """All three are asked for: the decrement alone lies as eta -> 0, where the curvature explodes."""
 
-LAST_BUT_ONE = 1e-5
-"""Decrement after which one more step is expected to be the last."""
-
 
 def solve_dual(
     problem: Problem,
@@ -377,7 +374,7 @@ def _newton(
     floor = problem.eta_floor
     here = problem.moments(eta, theta, scatter=True)
     value = _value(problem, theta, here)
-    decrement, jitter = np.inf, 0.0
+    decrement, before, jitter = np.inf, 1.0, 0.0
     for iteration in range(max_iterations):
         g_eta, g_theta = _gradient(problem, theta, here)
         hessian = _hessian(problem, here)
@@ -401,8 +398,10 @@ def _newton(
         length = 1.0 if stretch >= least else least / stretch
         rounding = 1e-14 * max(1.0, abs(value))
         # The first try is mostly good enough, so its curvature is taken in the same pass; but
-        # where it should be the last, by quadratic convergence, none may be needed.
-        scatter = decrement > LAST_BUT_ONE
+        # where it should be the last, converging at least as fast as before, none is needed.
+        expected = decrement * min(1.0, decrement / before)
+        before = decrement
+        scatter = 10.0 * expected > DECREMENT_TOLERANCE
         while length > 1e-12:
             new_eta = max(eta * (1.0 + length * stretch), floor)
             if new_eta <= floor * (1.0 + 1e-9):
