@@ -50,6 +50,12 @@ def test_each_name_of_the_paper_map_exists(name: str) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_table_that_is_shown_has_a_result_file(page: Path) -> None:
+    names = re.findall(r"<!-- results: (.+?) -->", page.read_text())
+    assert [name for name in names if not (ROOT / f"results/{name}.md").exists()] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_relative_links_lead_somewhere(page: Path) -> None:
     links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
     broken = [
