@@ -36,6 +36,7 @@ from kreps.plotting import BLUE, GREY, ORANGE, STYLE
 from kreps.policies import BangBang, CostSensitiveGP
 from kreps.rollout import simulate
 from kreps.sparse_gp import PolicySums, SparseGP
+from kreps.threads import blas_threads
 from kreps.value import FourierBasis, RKHSBasis
 
 TASK = "kreps/SwingUp-v0"
@@ -93,7 +94,7 @@ def errors(seed: int) -> dict[str, dict[int, tuple[float, float, float]]]:
 
 
 def accuracy(out: Path) -> None:
-    with kreps_threads():
+    with blas_threads(1):
         by_seed = [errors(seed) for seed in SEEDS]
     names = ("weights (total variation)", "V (share of its spread)", "mean action (of half range)")
     with rc_context(STYLE):
@@ -359,12 +360,6 @@ def growth(out: Path) -> None:
         ],
     )
     write(out, "growth", {"by_rank": by_rank, "by_dimension": by_dimension}, figure, table)
-
-
-def kreps_threads() -> Any:
-    from kreps.threads import blas_threads
-
-    return blas_threads(1)
 
 
 def main() -> None:

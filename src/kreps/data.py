@@ -243,20 +243,30 @@ class Transitions:
     @classmethod
     def of(cls, rollouts: Sequence[Rollout]) -> Transitions:
         """Flatten at least one roll-out."""
-        lengths = np.array([len(r) for r in rollouts])
-        start = np.concatenate([[0], np.cumsum(lengths + 1)[:-1]])
-        state = np.concatenate([s + np.arange(k) for s, k in zip(start, lengths, strict=True)])
-        terminated = np.zeros(len(state), dtype=bool)
-        terminated[np.cumsum(lengths) - 1] = [r.terminated for r in rollouts]
-        return cls(
-            points=np.concatenate([r.observations for r in rollouts]),
-            state=state,
-            successor=state + 1,
-            start=start,
-            actions=np.concatenate([r.actions for r in rollouts]),
-            rewards=np.concatenate([r.rewards for r in rollouts]),
-            terminated=terminated,
+        return cls.laid_out(
+            np.concatenate([r.observations for r in rollouts]),
+            np.concatenate([r.actions for r in rollouts]),
+            np.concatenate([r.rewards for r in rollouts]),
+            np.array([len(r) for r in rollouts]),
+            np.array([r.terminated for r in rollouts]),
         )
+
+    @classmethod
+    def laid_out(
+        cls,
+        points: FloatArray,
+        actions: FloatArray,
+        rewards: FloatArray,
+        lengths: IntArray,
+        ended: BoolArray,
+    ) -> Transitions:
+        """R roll-outs laid end to end in arrays: (n + R, ds), (n, da), (n,), (R,) and (R,)."""
+        ends = np.cumsum(lengths)
+        state = np.arange(len(rewards)) + np.repeat(np.arange(len(lengths)), lengths)
+        terminated = np.zeros(len(rewards), dtype=bool)
+        terminated[ends - 1] = ended
+        start = ends - lengths + np.arange(len(lengths))
+        return cls(points, state, state + 1, start, actions, rewards, terminated)
 
     @classmethod
     def joined(cls, parts: Sequence[Transitions]) -> Transitions:

@@ -56,10 +56,6 @@ class ArrayChunk:
         return len(self.rewards)
 
     def load(self) -> Transitions:
-        ends = np.cumsum(self.lengths)
-        state = np.arange(len(self.rewards)) + np.repeat(np.arange(len(ends)), self.lengths)
-        terminated = np.zeros(len(state), dtype=bool)
-        terminated[ends - 1] = self.terminated
         values = [
             np.array(each, dtype=np.float64)  # off the disk, once
             for each in (self.observations, self.actions, self.rewards)
@@ -72,8 +68,7 @@ class ArrayChunk:
                     f"of a chunk of {len(each)}; leave that roll-out out"
                 )
         points, actions, rewards = values
-        start = np.concatenate([[0], ends[:-1] + np.arange(1, len(ends))])
-        return Transitions(points, state, state + 1, start, actions, rewards, terminated)
+        return Transitions.laid_out(points, actions, rewards, self.lengths, self.terminated)
 
 
 @dataclass(frozen=True)

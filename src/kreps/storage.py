@@ -20,7 +20,7 @@ import safetensors
 import safetensors.numpy
 
 from kreps.algorithms.state import LearnerState
-from kreps.arrays import FloatArray
+from kreps.arrays import FloatArray, IntArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window, is_sane
 from kreps.dataset import Dataset
 from kreps.errors import KrepsError, StorageError
@@ -482,7 +482,8 @@ def _rollout_parts(rollouts: Sequence[Rollout]) -> Tensors:
     }
 
 
-def _rollouts_of(tensors: Tensors, ds: str | int, da: str | int) -> list[Rollout]:
+def _laid_out(tensors: Tensors, ds: str | int, da: str | int) -> tuple[Tensors, IntArray]:
+    """Roll-outs end to end, and their lengths, once they are known to fit together."""
     t = _take(
         tensors,
         {
@@ -497,7 +498,12 @@ def _rollouts_of(tensors: Tensors, ds: str | int, da: str | int) -> list[Rollout
     whole = (lengths >= 1).all() and (lengths <= n).all() and (lengths % 1 == 0).all()
     if not whole or lengths.sum() != n or len(t["window.observations"]) != n + len(lengths):
         raise StorageError("the lengths of its roll-outs do not fit their data")
-    cuts = np.cumsum(lengths).astype(int)[:-1]
+    return t, lengths.astype(np.intp)
+
+
+def _rollouts_of(tensors: Tensors, ds: str | int, da: str | int) -> list[Rollout]:
+    t, lengths = _laid_out(tensors, ds, da)
+    cuts = np.cumsum(lengths)[:-1]
     observations = np.split(t["window.observations"], cuts + np.arange(1, len(lengths)))
     actions = np.split(t["window.actions"], cuts)
     rewards = np.split(t["window.rewards"], cuts)
@@ -547,13 +553,24 @@ class RolloutFile:
         return self.samples
 
     def load(self) -> Transitions:
-        data = Transitions.of(load_rollouts(self.path))
-        if len(data) != self.samples:
+        tensors, _ = read_arrays(self.path, "rollouts")
+        try:
+            t, lengths = _laid_out(tensors, "ds", "da")
+        except KrepsError as error:
+            raise _inconsistent(self.path, "file of roll-outs", error) from error
+        found = len(t["window.rewards"])
+        if found != self.samples:
             raise StorageError(
-                f"{self.path} holds {len(data)} samples, but had {self.samples} when the folder "
+                f"{self.path} holds {found} samples, but had {self.samples} when the folder "
                 "was opened; open it again"
             )
-        return data
+        return Transitions.laid_out(
+            t["window.observations"],
+            t["window.actions"],
+            t["window.rewards"],
+            lengths,
+            t["window.terminated"] != 0,
+        )
 
 
 def rollout_folder(path: str | Path) -> Dataset:

@@ -80,8 +80,9 @@ def update(
         DataError: no roll-outs at all, or some of another width than the task's.
     """
     if isinstance(rollouts, Dataset):
-        window, dataset = state.window, rollouts
+        window, dataset, seen = state.window, rollouts, None
     else:
+        seen = len(rollouts), sum(len(rollout) for rollout in rollouts)
         window = state.extended_window(rollouts, task)
         dataset = Dataset.of(window.rollouts)
     clock = Stopwatch()
@@ -158,12 +159,9 @@ def update(
     )
     clock.lap("policy")
 
-    new_state = replace(
-        state,
+    new_state = state.after_data(
+        *(seen or (count, n)),
         window=window,
-        iteration=state.iteration + 1,
-        rollouts=state.rollouts + (count if isinstance(rollouts, Dataset) else len(rollouts)),
-        steps=state.steps + (n if isinstance(rollouts, Dataset) else sum(map(len, rollouts))),
         policy=policy,
         value=basis.function(reward_unit * dual.theta),
         embedding_start=embedding_start,

@@ -69,12 +69,15 @@ class LearnerState:
 
     def after(self, rollouts: Sequence[Rollout], window: Window, **learnt: Any) -> LearnerState:
         """The state after an update from new ``rollouts``, with what was ``learnt`` replaced."""
+        return self.after_data(len(rollouts), sum(map(len, rollouts)), window=window, **learnt)
+
+    def after_data(self, rollouts: int, steps: int, **learnt: Any) -> LearnerState:
+        """The same after so many new roll-outs and steps, wherever they were."""
         return replace(
             self,
-            window=window,
             iteration=self.iteration + 1,
-            rollouts=self.rollouts + len(rollouts),
-            steps=self.steps + sum(len(r) for r in rollouts),
+            rollouts=self.rollouts + rollouts,
+            steps=self.steps + steps,
             **learnt,
         )
 
