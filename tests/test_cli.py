@@ -169,7 +169,7 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path) -> No
     assert int(rows[-1]["steps"]) == learner.state.steps
     for row in rows:
         assert 0 < float(row["kl"]) <= float(row["kl_bound"]) * 1.001
-        assert 1 <= float(row["effective_samples"]) <= int(row["samples"])
+        assert 1 <= float(row["effective_samples"]) <= int(row["weighted"])
         stages = [name for name in row if name.startswith("cpu_seconds_")]
         assert len(stages) >= 5 and sum(float(row[name]) for name in stages) > 0
 

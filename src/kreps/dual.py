@@ -19,6 +19,9 @@ import numpy as np
 from kreps.arrays import Array, FloatArray, as_numpy, namespace
 from kreps.linalg import cholesky
 
+ETA_LEAST = 1e-6
+"""Floor of the temperature where none is asked for: below it there is nothing left to gain."""
+
 
 class Problem(Protocol):
     """The data of one update, as the solver sees it."""

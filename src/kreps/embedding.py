@@ -10,9 +10,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
+
 from kreps.arrays import Array, FloatArray, as_numpy
 from kreps.kernels import Kernel
-from kreps.linalg import Cholesky, cholesky, with_diagonal
+from kreps.linalg import Cholesky, cholesky, solve_lower, with_diagonal
 from kreps.value import Basis
 
 
@@ -20,6 +22,30 @@ class TransitionModel(Protocol):
     def expected_features(self, successor_features: Array) -> Array:
         """``E[phi(s') | s_i, a_i]``, (n, r), from the observed ``phi(s'_i)``, (n, r)."""
         ...
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """How far a model is wrong, judged at each sample by what all others say of it.
+
+    Attributes:
+        targets: (n, r) what was to be predicted.
+        errors: (n, r) targets less their predictions from the other samples.
+    """
+
+    targets: FloatArray
+    errors: FloatArray
+
+    @property
+    def mean_square(self) -> float:
+        """``mean_i |e_i|^2``."""
+        return float(np.einsum("ij,ij->", self.errors, self.errors)) / len(self.errors)
+
+    @property
+    def relative(self) -> float:
+        """``sqrt(sum |e_i|^2 / sum |target_i|^2)``: one is no better than predicting zero."""
+        size = float(np.linalg.norm(self.targets))
+        return float(np.linalg.norm(self.errors)) / size if size > 0 else 0.0
 
 
 @dataclass(frozen=True)
@@ -54,6 +80,16 @@ class KernelEmbedding:
         """
         added = self.regulariser + self.factor.jitter
         return successor_features - added * self.factor.solve(successor_features)
+
+    def predictor(self, targets: FloatArray) -> Callable[[FloatArray], FloatArray]:
+        """What is expected of targets (n, r) as a function of inputs (m, ds + da)."""
+        solved = self.factor.solve(targets)
+        return lambda inputs: np.asarray(self.kernel.gram(inputs, self.inputs) @ solved)
+
+    def leave_one_out(self, targets: FloatArray) -> LeaveOneOut:
+        """In closed form, of targets (n, r): ``[C^-1 F']_i / [C^-1]_ii``."""
+        inverse = self.factor.inverse()
+        return LeaveOneOut(targets, inverse @ targets / np.diagonal(inverse)[:, None])
 
 
 @dataclass(frozen=True)
@@ -104,3 +140,19 @@ class FeatureRegression:
     def fit(cls, basis: Basis, sums: RegressionSums, regulariser: float) -> FeatureRegression:
         factor = cholesky(with_diagonal(sums.gram, regulariser))
         return cls(basis.function(factor.solve(sums.product)), factor.jitter)
+
+    @staticmethod
+    def leave_one_out(
+        psi: FloatArray, targets: FloatArray, regulariser: float, stands_for: float = 1.0
+    ) -> LeaveOneOut:
+        """That of a regression of targets (n, r) on features psi (n, q), in closed form.
+
+        Where these are a part of the samples, each ``stands_for`` as many of them.
+        """
+        sums = RegressionSums.of(psi, targets)
+        sums = RegressionSums(stands_for * sums.gram, stands_for * sums.product)
+        factor = cholesky(with_diagonal(sums.gram, regulariser))
+        residuals = targets - psi @ factor.solve(sums.product)
+        whitened = solve_lower(factor.lower, psi.T)
+        leverage = np.minimum(np.einsum("ij,ij->j", whitened, whitened), 1.0 - 1e-12)
+        return LeaveOneOut(targets, residuals / (1.0 - leverage)[:, None])

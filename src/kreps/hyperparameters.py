@@ -79,11 +79,14 @@ class PolicyLoss:
         distances: (g, m, m) squared distances of each factor at lengthscale one.
         targets: (m, da) commanded actions in units of the action scale.
         weights: (m,) the w_i.
+        within: (m,) sum of the variances of what a target is the mean of: the expected density of
+            all of it takes the place of the density of one action.
     """
 
     distances: FloatArray
     targets: FloatArray
     weights: FloatArray
+    within: FloatArray | float = 0.0
 
     def __call__(self, x: FloatArray) -> tuple[float, FloatArray]:
         """Value and gradient (g + 2,)."""
@@ -95,7 +98,7 @@ class PolicyLoss:
         kappa = np.diagonal(inverse)
         alpha = inverse @ self.targets
         e = alpha / kappa[:, None]
-        squares = np.einsum("ij,ij->i", e, e)
+        squares = np.einsum("ij,ij->i", e, e) + self.within
         variance = 1.0 / kappa + noise * (1.0 - 1.0 / self.weights)
         value = share @ (0.5 * actions * np.log(2.0 * np.pi * variance) + 0.5 * squares / variance)
         by_variance = 0.5 * share * (actions - squares / variance) / variance

@@ -315,6 +315,7 @@ class OnPolicyLearner(Learner[OnPolicy]):
             seed=self.seed,
             iteration=self.state.iteration,
             restart_probability=settings.restart_probability,
+            held_share=settings.held_share if first else 0.0,
             on_rollout=on_rollout,
         )
 
@@ -331,8 +332,8 @@ class KREPS(OnPolicyLearner[Settings]):
 
     Args:
         env, seed, periodic, threads: as of `Learner`.
-        recipe: ``"default"``, ``"paper"`` (close to the printed method), ``"images"`` (for
-            observations that are pictures) or a `kreps.Settings`.
+        recipe: ``"default"``, ``"observed"`` (one step on the actions that were taken), ``"paper"``
+            (close to the printed method) or a `kreps.Settings`.
         compute: who works on the chunks of updates of low rank, and in which arrays; not part of a
             checkpoint, so set it again after `resume`: ``learner.compute = ...``.
         **settings: any field of `kreps.Settings`, such as ``kl_bound``.

@@ -17,6 +17,7 @@ from PIL import Image
 from kreps.algorithms.state import LearnerState
 from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
+from kreps.diagnosis import effective_share
 from kreps.errors import ConfigurationError, StorageError
 from kreps.policies import CostSensitiveGP
 from kreps.sparse_gp import SparseGP
@@ -91,7 +92,7 @@ def learning_curve(
         middle.plot(steps, column("kl_bound"), color=GREY, lw=0.8, ls="--")
         middle.set_ylabel("KL and bound\n[nats]")
         middle.set_ylim(bottom=0)
-        bottom.plot(steps, column("effective_samples") / column("samples"), "o-", color=BLUE, ms=3)
+        bottom.plot(steps, effective_share(rows), "o-", color=BLUE, ms=3)
         bottom.set_ylabel("effective\nsample share")
         bottom.set_ylim(0, 1)
         bottom.set_xlabel("environment steps seen before")

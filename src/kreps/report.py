@@ -14,6 +14,7 @@ from rich.table import Table
 
 from kreps.controller import Policy
 from kreps.data import TaskSpec
+from kreps.diagnosis import Finding, diagnose
 from kreps.dual import Outcome
 from kreps.envs.references import REFERENCE_RESTART_PROBABILITY, REFERENCE_REWARDS
 from kreps.errors import ConfigurationError, EnvironmentFailure
@@ -21,10 +22,13 @@ from kreps.evaluation import EPISODES, STEPS, Evaluation, evaluate, stochastic_a
 from kreps.learner import KREPS
 from kreps.rollout import Environment, batch_model_of
 from kreps.runs import RunFolder
+from kreps.settings import settings_of
 from kreps.storage import write_atomically
 from kreps.threads import blas_threads
 
 console = Console()
+MOST_FINDINGS = 3
+"""Findings that the end of a run tells; `kreps diagnose` tells all."""
 
 
 def say(message: str) -> None:
@@ -61,13 +65,14 @@ def report_run(folder: RunFolder, learner: KREPS) -> None:
         f"\n{state.iteration} updates from {state.rollouts} roll-outs "
         f"({state.steps} environment steps). The learnt policy earns {greedy:.4g} per step "
         f"without noise and {evaluation['stochastic'].mean:.4g} with it."
-        + _in_words(_references(folder, learner), greedy)
+        + _in_words(_references(folder), greedy)
     )
     last = folder.rows()[-1]
     say(
         f"Last update {Outcome[last['outcome']]} (KL {float(last['kl']):.3f} of at most "
         f"{float(last['kl_bound']):g} nats, duality gap {float(last['gap']):.0e})."
     )
+    _say_limits(folder)
     say(f"Policy:    {folder.policy_file}  (kreps.load_policy reads it)")
     say(f"Numbers:   {folder.progress_file}, {folder.evaluation_file}")
     for path in pictures:
@@ -75,11 +80,73 @@ def report_run(folder: RunFolder, learner: KREPS) -> None:
     say(f"Go on:     kreps resume {folder.path} --iterations {2 * state.iteration}")
 
 
-def _references(folder: RunFolder, learner: KREPS) -> dict[str, float]:
+def _say_limits(folder: RunFolder) -> None:
+    """The gravest findings, with what to try."""
+    findings = [f for f in diagnosis_of(folder) if f.severity != "fine"]
+    for finding in findings[:MOST_FINDINGS]:
+        say_finding(folder, finding)
+    if findings:
+        say(f"All of it on one page: kreps diagnose {folder.path}")
+    else:
+        say(f"Nothing stands out that holds it back (kreps diagnose {folder.path}).")
+
+
+def say_finding(folder: RunFolder, finding: Finding) -> None:
+    """In words; commands with the run's own folder."""
+    say(f"{finding.severity.capitalize() + ':':<11}{finding.name}. {finding.sentence}")
+    if finding.remedy:
+        say(f"{'':<11}Try: {finding.remedy.replace('RUN', str(folder.path))}")
+
+
+def say_diagnosis(folder: RunFolder) -> list[Finding]:
+    """All findings, and what could not be judged."""
+    findings = diagnosis_of(folder)
+    for finding in findings:
+        say_finding(folder, finding)
+    if _rows(folder)[-1]["clipped"] == "nan":
+        say(
+            "Not judged: what the version that made this run did not record (model, noise, clipped "
+            "actions, cap of the basis); updates made with this one do."
+        )
+    return findings
+
+
+def _rows(folder: RunFolder) -> list[dict[str, str]]:
+    rows = folder.rows()
+    if not rows:
+        raise ConfigurationError(
+            f"{folder.progress_file} holds no iteration yet; make the next update with "
+            f"`kreps resume {folder.path}`"
+        )
+    return rows
+
+
+def diagnosis_of(folder: RunFolder) -> list[Finding]:
+    """What limits a run, from its files alone: no environment is made."""
+    rows = _rows(folder)
+    return diagnose(rows, folder.evaluation(int(rows[-1]["iteration"])), _references(folder))
+
+
+def draw_diagnosis(folder: RunFolder, findings: list[Finding], path: Path) -> Path:
+    from kreps import diagnosis_page, plotting
+
+    diagnosis_page.check_page_name(path)
+    page = diagnosis_page.page(
+        _rows(folder),
+        findings,
+        _references(folder),
+        f"{folder.config().environment}, {folder.path}",
+    )
+    return plotting.save(page, path)
+
+
+def _references(folder: RunFolder) -> dict[str, float]:
     """The task's reference values, where they are of the process that was learnt on."""
-    if learner.settings.restart_probability != REFERENCE_RESTART_PROBABILITY:
+    config = folder.config()
+    settings = settings_of(config.recipe, **config.settings)
+    if settings.restart_probability != REFERENCE_RESTART_PROBABILITY:
         return {}
-    return REFERENCE_REWARDS.get(folder.config().environment, {})
+    return REFERENCE_REWARDS.get(config.environment, {})
 
 
 def _in_words(references: dict[str, float], reward: float) -> str:
@@ -89,14 +156,10 @@ def _in_words(references: dict[str, float], reward: float) -> str:
     (best_name, best), *others = references.items()
     worst_name, worst = others[-1]
     way = (reward - worst) / (best - worst)
-    text = (
+    return (
         f" That is {way:.0%} of the way from {worst_name} ({worst:g}) "
         f"to the {best_name} ({best:g})."
     )
-    for name, value in others[:-1]:
-        if abs(reward - value) < 0.05 * abs(best - worst):
-            text += f" It is near {name} ({value:g}): the run is probably stuck there."
-    return text
 
 
 def evaluate_run(
@@ -150,7 +213,7 @@ def plot_run(folder: RunFolder, learner: KREPS) -> list[Path]:
     evaluation = folder.evaluation(learner.state.iteration)
     with console.status("drawing ..."):
         curve = plotting.learning_curve(
-            rows, _references(folder, learner), evaluation, folder.config().environment
+            rows, _references(folder), evaluation, folder.config().environment
         )
         drawn = [plotting.save(curve, folder.path / "learning_curve.png")]
         if learner.task.observation_size == 2:

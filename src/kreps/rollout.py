@@ -6,7 +6,7 @@ Both ways address their randomness by roll-out, so they give the same data from 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, cast
+from typing import Any, Protocol, cast
 
 import gymnasium as gym
 import numpy as np
@@ -92,6 +92,37 @@ def batch_model_of(env: Environment) -> BatchModel | None:
     return None
 
 
+class Noise(Protocol):
+    """Where a roll-out's policy noise comes from: a generator, or something in its place."""
+
+    def standard_normal(self, size: Any) -> FloatArray: ...
+
+
+class HeldNoise:
+    """Standard normal noise of which each coordinate stays the same for a random time.
+
+    White noise averages out over a few steps, so that slow systems hardly move.  How long a slow
+    one needs is not known beforehand, so each roll-out draws its own mean time.
+
+    Args:
+        rng: of the noise.
+        longest: the mean time in steps is log-uniform between one and this.
+    """
+
+    def __init__(self, rng: np.random.Generator, longest: float) -> None:
+        self._rng = rng
+        self._change = float(np.exp(-rng.uniform(0.0, np.log(longest))))
+        self._held: FloatArray | None = None
+
+    def standard_normal(self, size: Any) -> FloatArray:
+        fresh = self._rng.standard_normal(size)
+        if self._held is not None:
+            changes = self._rng.uniform(size=size) < self._change
+            fresh = np.where(changes, fresh, self._held)
+        self._held = fresh
+        return fresh
+
+
 def collect(
     env: Environment,
     task: TaskSpec,
@@ -101,11 +132,13 @@ def collect(
     seed: int,
     iteration: int,
     restart_probability: float,
+    held_share: float = 0.0,
     on_rollout: Callable[[int], None] | None = None,
 ) -> list[Rollout]:
     """``count`` roll-outs of random length, as the paper's protocol collects them.
 
     Args:
+        held_share: share of the roll-outs whose noise is held, evenly among them.
         on_rollout: called with the number of roll-outs that are complete.
 
     Raises:
@@ -113,7 +146,11 @@ def collect(
         DataError: it returned NaN, infinities or observations of another size.
     """
     seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
-    noises = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
+    noises: list[Noise] = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
+    for j in range(count):
+        if int((j + 1) * held_share) > int(j * held_share):
+            rng = generator(seed, Purpose.POLICY, iteration, j)
+            noises[j] = HeldNoise(rng, 1.0 / restart_probability)
     lengths = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
     return simulate(env, task, policy, seeds, noises, lengths, on_rollout)
 
@@ -210,7 +247,7 @@ def simulate(
     task: TaskSpec,
     policy: StochasticPolicy,
     seeds: Sequence[int],
-    noises: Sequence[np.random.Generator],
+    noises: Sequence[Noise],
     lengths: Sequence[int],
     on_rollout: Callable[[int], None] | None = None,
 ) -> list[Rollout]:
@@ -234,7 +271,7 @@ def _simulate_batch(
     task: TaskSpec,
     policy: StochasticPolicy,
     seeds: Sequence[int],
-    noises: Sequence[np.random.Generator],
+    noises: Sequence[Noise],
     lengths: Sequence[int],
 ) -> list[Rollout]:
     rngs = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
@@ -275,7 +312,7 @@ def _simulate_one(
     task: TaskSpec,
     policy: StochasticPolicy,
     seed: int,
-    noise: np.random.Generator,
+    noise: Noise,
     length: int,
     number: int,
 ) -> Rollout:

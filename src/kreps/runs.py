@@ -3,7 +3,9 @@
 ``config.json`` says what was asked for; after each iteration ``progress.csv``,
 ``policy.safetensors`` and then ``checkpoint.safetensors`` are replaced, each atomically.  The
 checkpoint is what counts: the others are never behind it, and rows ahead of it are dropped on
-resuming.  In ``progress.csv`` eta, dual, primal and gap are in standard deviations of the reward.
+resuming.  In ``progress.csv`` eta, its floor, dual, primal and gap are in standard deviations of
+the reward; ``weighted`` are the samples that the last step gave weights to, imagined ones too;
+``policy_noise`` is the policy's near its data, in units of half the action range.
 """
 
 from __future__ import annotations
@@ -35,7 +37,19 @@ STAGES = (
     "dual",
     "policy fit",
     "policy",
+    "imagined step",
 )
+NEWER = (
+    "cpu_seconds_imagined_step",
+    "weighted",
+    "model_error",
+    "clipped",
+    "eta_floor",
+    "policy_noise",
+    "max_rank",
+)
+"""Columns that runs of earlier versions have not; there, and where there is no model, NaN."""
+
 COLUMNS = (
     "iteration",
     "rollouts",
@@ -57,7 +71,8 @@ COLUMNS = (
     "newton_iterations",
     "outcome",
     "jitter",
-    *(f"cpu_seconds_{stage.replace(' ', '_')}" for stage in STAGES),
+    *(f"cpu_seconds_{stage.replace(' ', '_')}" for stage in STAGES[:-1]),
+    *NEWER,
 )
 
 
@@ -144,6 +159,8 @@ class RunFolder:
     def rows(self) -> list[dict[str, str]]:
         """What ``progress.csv`` holds, a dictionary a row; empty if there is no such file.
 
+        Rows of earlier versions have "nan" in the columns that are `NEWER`.
+
         Raises:
             StorageError: it is not what a run writes.
         """
@@ -151,13 +168,18 @@ class RunFolder:
             with open(self.progress_file, newline="") as file:
                 reader = csv.DictReader(file)
                 rows = list(reader)
-                if tuple(reader.fieldnames or ()) != COLUMNS:
+                columns = tuple(reader.fieldnames or ())
+                if columns == COLUMNS[: -len(NEWER)]:
+                    rows = [{**row, **dict.fromkeys(NEWER, "nan")} for row in rows]
+                elif columns != COLUMNS:
                     raise ValueError("its columns are not those of a run")
                 for row in rows:
                     if row["outcome"] not in Outcome.__members__:
                         raise ValueError(f"it has an unknown outcome {row['outcome']!r:.40}")
+                    values = {name: float(row[name]) for name in COLUMNS if name != "outcome"}
                     if not all(
-                        math.isfinite(float(row[name])) for name in COLUMNS if name != "outcome"
+                        math.isfinite(value) or (name in NEWER and math.isnan(value))
+                        for name, value in values.items()
                     ):
                         raise ValueError("it holds NaN or infinities")
         except FileNotFoundError:
@@ -226,5 +248,11 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "newton_iterations": dual.iterations,
         "outcome": dual.outcome.name,
         "jitter": info.jitter,
+        "weighted": len(dual.weights),
+        "model_error": info.model_error,
+        "clipped": info.clipped,
+        "eta_floor": info.eta_floor,
+        "policy_noise": math.sqrt(info.policy_parameters[-1]),
+        "max_rank": learner.settings.max_rank,
         **{f"cpu_seconds_{s.replace(' ', '_')}": round(seconds.get(s, 0.0), 5) for s in STAGES},
     }

@@ -24,12 +24,14 @@ from kreps.algorithms.chunk_sums import (
     StartFeatures,
     StreamedProblem,
 )
+from kreps.algorithms.imagined_step import Outlook, imagine
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
-    ETA_LEAST,
     PolicySamples,
     UpdateInfo,
     policy_hyperparameters,
+    share_clipped,
+    stationarity_ridge,
 )
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
@@ -41,12 +43,19 @@ from kreps.arrays import FloatArray, IntArray, as_float
 from kreps.compute import Compute
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.dataset import Dataset
-from kreps.dual import DualProblem, DualSolution, effective_sample_size, solve_dual, standardise
-from kreps.embedding import FeatureRegression
+from kreps.dual import (
+    ETA_LEAST,
+    DualProblem,
+    DualSolution,
+    effective_sample_size,
+    solve_dual,
+    standardise,
+)
+from kreps.embedding import FeatureRegression, RegressionSums
 from kreps.kernels import Kernel
 from kreps.policies import MAX_SUPPORT
 from kreps.settings import Settings
-from kreps.sparse_gp import SparseGP
+from kreps.sparse_gp import PolicySums, SparseGP
 from kreps.value import Basis, FourierBasis, RBFGrid, RKHSBasis
 
 EXACT_LIMIT = 3_000
@@ -108,13 +117,14 @@ def update(
     # Eq. 4: the expected features of each successor, linear in features of state and action
     bases = [basis]
     from_own = settings.model == "change"
-    model, embedding_start = None, None
+    model, errors, outlook, embedding_start = None, None, None, None
     if settings.model != "sample":
         inputs = state_actions(sample, task)
         own, after = replace(changes, place=as_float).both(sample)
-        targets = after - own if from_own else after
+        origin = own if from_own else np.zeros_like(own)
+        successors = after - origin
         joint_kernel, regulariser, embedding_start = embedding_hyperparameters(
-            inputs, targets, kernel, task, state.embedding_start, rng
+            inputs, successors, kernel, task, state.embedding_start, rng
         )
         clock.lap("embedding fit")
         embedded = choose_basis(joint_kernel, inputs, settings, settings.rank, rng)
@@ -122,19 +132,31 @@ def update(
         says = EmbeddingSums(changes, embedded, task, from_own)
         sums = reduce(add, compute.map(says, dataset.chunks))
         model = FeatureRegression.fit(embedded, sums, regulariser)
+        psi = embedded.features(inputs)
+        errors = FeatureRegression.leave_one_out(psi, successors, regulariser, n / len(sample))
+        said = RegressionSums.of(psi, Outlook.targets(successors, rewards[sampled]))
+        outlook = Outlook(
+            states=sample.states,
+            features=own,
+            origin=origin,
+            start=changes.start,
+            rewards=rewards[sampled],
+            predict=FeatureRegression.fit(embedded, said, regulariser).mean,
+        )
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
+    ridge = stationarity_ridge(settings, errors)
     problem = StreamedProblem(
         dataset=dataset,
         rows=BellmanRows(changes, model, task, from_own, settings.restart_probability),
         rewards=rewards,
         kl_bound=settings.kl_bound,
-        ridge=settings.ridge / n,
+        ridge=ridge / n,
         eta_floor=max(settings.eta_floor, ETA_LEAST),
         compute=compute,
     )
-    dual = solve(problem, settings, sample, sampled)
+    dual = solve(problem, ridge, sample, sampled)
     clock.lap("dual")
 
     # Sec. 2: generalise the weighted samples to a stochastic policy
@@ -143,21 +165,34 @@ def update(
     heard = some(np.flatnonzero(weights), rng)
     among = dataset.take(heard)
     support = PolicySamples(
-        among.states, task.scaled(among.actions), weights[heard], float(weights.sum())
+        among.states,
+        task.scaled(among.actions),
+        weights[heard],
+        float(weights.sum()),
+        np.zeros(len(heard)),
     )
     x = policy_hyperparameters(support, kernel, settings, state.policy_start, rng)
     clock.lap("policy fit")
-    policy_kernel = kernel.with_lengthscales(np.exp(x[:-2]))
-    centres = choose_centres(
-        policy_kernel, support.states, min(settings.rank, MAX_SUPPORT), settings, rng
-    )
-    bases.append(centres)
+    centres = policy_centres(support, kernel, x, settings, rng)
     says_of_policy = ChunkPolicySums(centres, task, place)
-    said = reduce(add, compute.map(says_of_policy, dataset.chunks, dataset.split(weights)))
-    policy = SparseGP.fit(
-        task, centres, said, signal=float(np.exp(x[-2])), noise=float(np.exp(x[-1]))
-    )
+    spoken = reduce(add, compute.map(says_of_policy, dataset.chunks, dataset.split(weights)))
+    policy = fit_sparse(task, centres, spoken, x)
     clock.lap("policy")
+
+    # the same once more, for other actions in the states of the sample
+    if settings.imagined and outlook is not None and seen is not None:
+        share = dual.weights[sampled] / dual.weights[sampled].sum()
+        imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
+        dual = solve_dual(imagined.problem, start=(dual.eta, dual.theta))
+        support = PolicySamples.imagined(sample, imagined, dual.weights, task)
+        x = policy_hyperparameters(support, kernel, settings, x, rng)
+        centres = policy_centres(support, kernel, x, settings, rng)
+        features = centres.features(support.states)
+        policy = fit_sparse(
+            task, centres, PolicySums.of(features, support.weights, support.targets), x
+        )
+        clock.lap("imagined step")
+    bases.append(centres)
 
     new_state = state.after_data(
         *(seen or (count, n)),
@@ -170,6 +205,10 @@ def update(
     info = UpdateInfo(
         samples=n,
         kl_bound=settings.kl_bound,
+        eta_floor=problem.eta_floor,
+        ridge=ridge,
+        model_error=float("nan") if errors is None else errors.relative,
+        clipped=share_clipped(sample.actions, task),
         rank=problem.rank,
         rank_residual=basis.residual,
         dual=dual,
@@ -217,8 +256,28 @@ def choose_centres(
     return RKHSBasis.fit(kernel, points, tolerance=settings.basis_tolerance, max_rank=rank)[0]
 
 
+def policy_centres(
+    support: PolicySamples,
+    kernel: Kernel,
+    x: FloatArray,
+    settings: Settings,
+    rng: np.random.Generator,
+) -> RKHSBasis:
+    """Inducing points of the policy at log hyper-parameters ``x`` (g + 2,)."""
+    policy_kernel = kernel.with_lengthscales(np.exp(x[:-2]))
+    rank = min(settings.rank, MAX_SUPPORT)
+    return choose_centres(policy_kernel, support.states, rank, settings, rng)
+
+
+def fit_sparse(task: TaskSpec, centres: RKHSBasis, sums: PolicySums, x: FloatArray) -> SparseGP:
+    """The policy at log hyper-parameters ``x`` (g + 2,)."""
+    return SparseGP.fit(
+        task, centres, sums, signal=float(np.exp(x[-2])), noise=float(np.exp(x[-1]))
+    )
+
+
 def solve(
-    problem: StreamedProblem, settings: Settings, sample: Transitions, sampled: IntArray
+    problem: StreamedProblem, ridge: float, sample: Transitions, sampled: IntArray
 ) -> DualSolution:
     """The dual on the sample, in memory; then on more and more chunks, each from the last solution.
 
@@ -230,7 +289,7 @@ def solve(
         rewards=problem.rewards[sampled],
         differences=replace(rows, changes=replace(rows.changes, place=as_float))(sample),
         kl_bound=problem.kl_bound,
-        ridge=settings.ridge / min(GROWTH * len(sampled), len(problem.rewards)),
+        ridge=ridge / min(GROWTH * len(sampled), len(problem.rewards)),
         eta_floor=problem.eta_floor,
     )
     dual = solve_dual(near)
@@ -241,9 +300,7 @@ def solve(
         stride *= GROWTH
     while stride:
         part = problem.part(slice(None, None, stride))
-        part = replace(
-            part, ridge=settings.ridge / min(GROWTH * len(part.rewards), len(problem.rewards))
-        )
+        part = replace(part, ridge=ridge / min(GROWTH * len(part.rewards), len(problem.rewards)))
         dual = solve_dual(part, start=(dual.eta, dual.theta))
         stride //= GROWTH
     return dual

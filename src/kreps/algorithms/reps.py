@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
     fit_embedding,
@@ -17,6 +18,7 @@ from kreps.algorithms.transition_model import (
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.dual import (
+    ETA_LEAST,
     DualProblem,
     DualSolution,
     Outcome,
@@ -24,7 +26,7 @@ from kreps.dual import (
     solve_dual,
     standardise,
 )
-from kreps.embedding import KernelEmbedding, SampleModel, TransitionModel
+from kreps.embedding import KernelEmbedding, LeaveOneOut, SampleModel, TransitionModel
 from kreps.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel
 from kreps.policies import CostSensitiveGP
@@ -34,9 +36,8 @@ from kreps.value import Basis, RBFGrid, RKHSBasis
 DROPPED_WEIGHT = 0.05
 """Samples with ``n p_i`` below this do not enter the policy: they say next to nothing."""
 
-ETA_LEAST = 1e-6
-"""Floor of the temperature where none is asked for: below it there is nothing left to gain."""
-
+RIDGE_LEAST = 1e-6
+"""Least ridge where the model asks for none: it keeps V finite in directions that no state has."""
 
 _NOTES = {
     Outcome.AT_FLOOR: "eta at its floor",
@@ -52,8 +53,13 @@ class UpdateInfo:
     Attributes:
         samples: n.
         kl_bound: epsilon.
+        eta_floor: least temperature, in standard deviations of the reward.
+        ridge: rho times the number of samples.
+        model_error: of the transition model by leave-one-out, relative (`LeaveOneOut.relative`);
+            nan without a model.
+        clipped: share of the commanded actions of the new samples that lie beyond the limits.
         rank: features of V; ``rank_residual`` is the largest squared residual they leave.
-        dual: the solution with its certificate.
+        dual: the last step's solution with its certificate.
         effective_samples: effective sample size of the weights.
         support: support points of the policy.
         state_lengthscales: of V's kernel.
@@ -66,6 +72,10 @@ class UpdateInfo:
 
     samples: int
     kl_bound: float
+    eta_floor: float
+    ridge: float
+    model_error: float
+    clipped: float
     rank: int
     rank_residual: float
     dual: DualSolution
@@ -126,15 +136,17 @@ def update(
     )
     clock.lap("embedding fit")
     expected = origin + model.expected_features(successors)
+    rewards, reward_unit = standardise(data.rewards)
+    errors = model.leave_one_out(successors) if isinstance(model, KernelEmbedding) else None
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
-    rewards, reward_unit = standardise(data.rewards)
+    ridge = stationarity_ridge(settings, errors)
     problem = DualProblem(
         rewards=rewards,
         differences=feature_differences(data, features, expected, settings.restart_probability),
         kl_bound=settings.kl_bound,
-        ridge=settings.ridge / len(data),
+        ridge=ridge / len(data),
         eta_floor=max(settings.eta_floor, ETA_LEAST),
     )
     dual = solve_dual(problem)
@@ -147,6 +159,23 @@ def update(
     policy = fit_policy(support, kernel, task, policy_x)
     clock.lap("policy")
 
+    # the same once more, for other actions in these states
+    if settings.imagined and isinstance(model, KernelEmbedding):
+        outlook = Outlook(
+            states=data.states,
+            features=features[data.state],
+            origin=origin,
+            start=features[data.start].mean(axis=0),
+            rewards=rewards,
+            predict=model.predictor(Outlook.targets(successors, rewards)),
+        )
+        imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
+        dual = solve_dual(imagined.problem, start=(dual.eta, dual.theta))
+        support = PolicySamples.imagined(data, imagined, dual.weights, task)
+        policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
+        policy = fit_policy(support, kernel, task, policy_x)
+        clock.lap("imagined step")
+
     new_state = state.after(
         rollouts,
         window,
@@ -158,6 +187,10 @@ def update(
     info = UpdateInfo(
         samples=len(data),
         kl_bound=settings.kl_bound,
+        eta_floor=problem.eta_floor,
+        ridge=ridge,
+        model_error=float("nan") if errors is None else errors.relative,
+        clipped=share_clipped(new_actions(data, rollouts), task),
         rank=features.shape[1],
         rank_residual=basis.residual,
         dual=dual,
@@ -223,6 +256,24 @@ def feature_differences(
     )
 
 
+def stationarity_ridge(settings: Settings, errors: LeaveOneOut | None) -> float:
+    """rho times the number of samples: as given, or the model's mean squared error in features."""
+    if settings.ridge is not None:
+        return settings.ridge
+    assert errors is not None  # settings without a model name a ridge
+    return max(errors.mean_square, RIDGE_LEAST)
+
+
+def new_actions(data: Transitions, rollouts: Sequence[Rollout]) -> FloatArray:
+    """Commanded actions (n, da) of the newest roll-outs, or of all if there are no new ones."""
+    return data.actions[-sum(map(len, rollouts)) :]
+
+
+def share_clipped(actions: FloatArray, task: TaskSpec) -> float:
+    """Share of commanded action coordinates (n, da) that lie beyond the limits."""
+    return float(np.mean((actions < task.action_low) | (actions > task.action_high)))
+
+
 @dataclass(frozen=True)
 class PolicySamples:
     """The weighted samples that the policy is fitted to.
@@ -232,19 +283,44 @@ class PolicySamples:
         targets: (m, da) commanded actions around their centre, in units of the action scale.
         weights: (m,) ``p_i / sum p^2``: over all samples they add up to the effective sample size.
         evidence: sum of the weights of all samples kept, whether or not they are among these.
+        within: (m,) variance of what each target is the mean of, summed over its coordinates.
     """
 
     states: FloatArray
     targets: FloatArray
     weights: FloatArray
     evidence: float
+    within: FloatArray
 
     @classmethod
     def of(cls, data: Transitions, p: FloatArray, task: TaskSpec) -> PolicySamples:
         kept = len(p) * p >= DROPPED_WEIGHT
         targets = task.scaled(data.actions[kept])
         weights = p[kept] * effective_sample_size(p)
-        return cls(data.states[kept], targets, weights, float(weights.sum()))
+        nothing = np.zeros(len(weights))
+        return cls(data.states[kept], targets, weights, float(weights.sum()), nothing)
+
+    @classmethod
+    def imagined(
+        cls, data: Transitions, samples: ImaginedSamples, p: FloatArray, task: TaskSpec
+    ) -> PolicySamples:
+        """One for each state: the weighted mean of the actions that were imagined there.
+
+        It leaves the process as many support points as there are states, and a target that several
+        actions agree on is worth more than one of them.
+        """
+        kept = len(p) * p >= DROPPED_WEIGHT
+        each = p[kept] * effective_sample_size(p)
+        actions = task.scaled(samples.actions[kept])
+        rows, group = np.unique(samples.rows[kept], return_inverse=True)
+        weights = np.zeros(len(rows))
+        targets = np.zeros((len(rows), task.action_size))
+        within = np.zeros(len(rows))
+        np.add.at(weights, group, each)
+        np.add.at(targets, group, (each / weights[group])[:, None] * actions)
+        squares = np.sum((actions - targets[group]) ** 2, axis=1)
+        np.add.at(within, group, each / weights[group] * squares)
+        return cls(data.states[rows], targets, weights, float(weights.sum()), within)
 
 
 def policy_hyperparameters(
@@ -267,7 +343,7 @@ def policy_hyperparameters(
     g = len(median)
     share = samples.weights / samples.weights.sum()
     centred = samples.targets - share @ samples.targets
-    spread = float(np.mean(share @ centred**2))
+    spread = float(np.mean(share @ centred**2)) + float(share @ samples.within) / centred.shape[1]
     log_spread = np.log(max(spread, 1e-4))
     centre = np.concatenate([median - 0.5, [log_spread - 0.3, log_spread - 1.0]])
     if settings.policy_fit == "map":
@@ -291,6 +367,7 @@ def policy_hyperparameters(
         factor_distances(state_kernel.factors, samples.states[rows]),
         samples.targets[rows],
         samples.weights[rows],
+        samples.within[rows],
     )
     return minimise(loss, prior, centre if start is None else start)
 

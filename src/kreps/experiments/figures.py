@@ -160,7 +160,9 @@ def write_figure(
     rows = named_rows(rows_of(results))
     if name == "swing-up":
         write_atomically(folder / f"{name}-steps.md", (steps_table(rows) + "\n").encode())
-    references = {row["method"]: REFERENCE_REWARDS[TASKS[row["task"]].environment] for row in rows}
+    references = {
+        row["method"]: REFERENCE_REWARDS.get(TASKS[row["task"]].environment, {}) for row in rows
+    }
     source = f"{command}   (commit {commits_of(results)})"
     if name in SEED_BY_SEED:
         figure = plotting.comparison(rows, references, TITLES[name], source)

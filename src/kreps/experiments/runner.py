@@ -20,14 +20,15 @@ from kreps.errors import CellFailure
 from kreps.evaluation import EPISODES
 from kreps.experiments.cells import Cell, cell_of, read_cell, run_cell, write_cell
 from kreps.experiments.search import tuned_options
-from kreps.experiments.specs import BEYOND, FIGURES, TASKS
+from kreps.experiments.specs import BEYOND, FIGURES, FIRST_SEED, TASKS
 
 
 def figure_cells(figure: str, trials: int, iterations: int | None) -> list[Cell]:
-    """The cells that a figure shows: seeds 0 to ``trials - 1`` of each of its curves.
+    """The cells that a figure shows: ``trials`` seeds of each of its curves.
 
     They come seed by seed, so that partial results compare.
     """
+    first = FIRST_SEED.get(figure, 0)
     return [
         cell_of(
             task,
@@ -37,7 +38,7 @@ def figure_cells(figure: str, trials: int, iterations: int | None) -> list[Cell]
             iterations=iterations,
             episodes=(TASKS[task].episodes, EPISODES),
         )
-        for seed in range(trials)
+        for seed in range(first, first + trials)
         for task, method in (FIGURES | BEYOND)[figure]
     ]
 

@@ -47,6 +47,15 @@ TASKS: dict[str, Task] = {
         "kreps/SwingUp-v0", 20, ranges=((-2.0, 5.0), (-12.0, 12.0)), episodes=EPISODES
     ),
     "images": Task("kreps/ImageSwingUp-v0", 15),
+    # past the paper: longer, from a plain Gaussian, and with the learner's own first policy
+    "swing-up, long": Task("kreps/SwingUp-v0", 40, episodes=EPISODES),
+    "swing-up, Gaussian start": Task(
+        "kreps/SwingUp-v0", 40, {"exploration": "gaussian"}, episodes=EPISODES
+    ),
+    "reaching, own start": Task("kreps/Reaching-v0", 15, episodes=50),
+    "images, long": Task("kreps/ImageSwingUp-v0", 20, episodes=50),
+    "pendulum": Task("Pendulum-v1", 15, episodes=50),
+    "mountain-car": Task("MountainCarContinuous-v0", 15, episodes=20),
 }
 
 
@@ -75,29 +84,42 @@ ANY_STATE = "value iteration on a grid (simulator set to any state)"
 NPALP = "NPALP"
 DEFAULT = "kreps (default)"
 PAPER = "paper-like"
-IMAGES = "kreps (images)"
+OBSERVED = "observed actions only"
 LOW_RANK = "low rank"
 UNIFORM = "low rank, uniform"
 FOURIER = "low rank, Fourier"
-LOW_RANK_IMAGES = "kreps (images), low rank"
 REMEMBERING = "nothing forgotten"
 
 METHODS: dict[str, Method] = {
-    KERNEL: Method("reps"),
-    SAMPLE: Method("reps", {"model": "sample"}),
-    FEATURES: Method("reps", {"features": "grid"}),
+    # those of the paper learn from the actions that were taken, one step in each update
+    KERNEL: Method("reps", {"recipe": "observed"}),
+    SAMPLE: Method("reps", {"recipe": "observed", "model": "sample"}),
+    FEATURES: Method("reps", {"recipe": "observed", "features": "grid"}),
     VALUES: Method("value-iteration"),
     ANY_STATE: Method("grid-value-iteration", once=True),
     NPALP: Method("npalp"),
     DEFAULT: Method("reps", tuned=False),
     PAPER: Method("reps", {"recipe": "paper"}, tuned=False),
-    IMAGES: Method("reps", {"recipe": "images"}, tuned=False),
-    LOW_RANK: Method("reps", {"approximation": "pivoted"}, tuned=False),
-    UNIFORM: Method("reps", {"approximation": "uniform"}, tuned=False),
-    FOURIER: Method("reps", {"approximation": "fourier"}, tuned=False),
-    LOW_RANK_IMAGES: Method("reps", {"recipe": "images", "approximation": "pivoted"}, tuned=False),
-    REMEMBERING: Method("reps", {"window": None}, tuned=False),
+    OBSERVED: Method("reps", {"recipe": "observed"}, tuned=False),
+    LOW_RANK: Method("reps", {"recipe": "observed", "approximation": "pivoted"}, tuned=False),
+    UNIFORM: Method("reps", {"recipe": "observed", "approximation": "uniform"}, tuned=False),
+    FOURIER: Method("reps", {"recipe": "observed", "approximation": "fourier"}, tuned=False),
+    REMEMBERING: Method("reps", {"recipe": "observed", "window": None}, tuned=False),
 }
+
+ABLATIONS: dict[str, Options] = {
+    "no imagined step": {"imagined": 0},
+    "one imagined action": {"imagined": 1},
+    "ridge 0.1": {"ridge": 0.1},
+    "floor 0.1": {"eta_floor": 0.1},
+    "white first noise": {"held_share": 0.0},
+    "half the KL bound": {"kl_bound": 0.5},
+    "hard ranges": {"policy_fit": "bounded"},
+    "successor embedded": {"model": "embedding"},
+}
+"""Each part of the default taken back alone: what stands in its place in the paper or before."""
+
+METHODS |= {name: Method("reps", options, tuned=False) for name, options in ABLATIONS.items()}
 
 Curve = tuple[str, str]
 """A task and a method."""
@@ -114,12 +136,28 @@ FIGURES: dict[str, tuple[Curve, ...]] = {
 }
 BEYOND: dict[str, tuple[Curve, ...]] = {
     "low-rank": (
-        *(("swing-up", m) for m in (DEFAULT, LOW_RANK, UNIFORM, FOURIER)),
-        *(("reaching", m) for m in (DEFAULT, LOW_RANK)),
-        *(("images", m) for m in (IMAGES, LOW_RANK_IMAGES)),
+        *(("swing-up", m) for m in (OBSERVED, LOW_RANK, UNIFORM, FOURIER)),
+        *((task, m) for task in ("reaching", "images") for m in (OBSERVED, LOW_RANK)),
     ),
-    "forgetting": tuple(("swing-up", m) for m in (DEFAULT, REMEMBERING)),
+    "forgetting": tuple(("swing-up", m) for m in (OBSERVED, REMEMBERING)),
+    # KREPS(env) and nothing else
+    "untuned": tuple(
+        (task, DEFAULT)
+        for task in (
+            "swing-up, long",
+            "swing-up, Gaussian start",
+            "reaching, own start",
+            "images, long",
+            "pendulum",
+            "mountain-car",
+        )
+    ),
+    "ablation": tuple(
+        (task, m) for task in ("swing-up", "reaching, own start") for m in (DEFAULT, *ABLATIONS)
+    ),
 }
 """Experiments that are not among the paper's: run by name, not by ``all``."""
+FIRST_SEED = {"untuned": 400, "ablation": 400}
+"""Of experiments that confirm what was found on others; 0 elsewhere."""
 PICTURES = ("figure-2a",)
 """Figures without an experiment: the features of the images."""

@@ -1,0 +1,640 @@
+"""What limits a run: each cause is found where it is, and nowhere else, and the page shows it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable
+from itertools import pairwise
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib import rcParams
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from PIL import Image
+
+from kreps import cli, diagnosis, diagnosis_page, plotting, report
+from kreps.diagnosis import Finding, Trend, diagnose, trend
+from kreps.dual import Outcome
+from kreps.envs.references import REFERENCE_REWARDS
+from kreps.errors import StorageError
+from kreps.runs import COLUMNS, NEWER, RunConfig, RunFolder, progress_row
+from kreps.settings import Settings
+
+NAME = "kreps/SwingUp-v0"
+REFERENCES = REFERENCE_REWARDS[NAME]
+CAUSES = {
+    "updates",
+    "local optimum",
+    "progress",
+    "step",
+    "effective samples",
+    "transition model",
+    "basis of V",
+    "exploration noise",
+    "clipped actions",
+}
+RISING = list(np.linspace(-90.0, -30.0, 12))
+LEVEL = [-90.0, -70.0, -50.0, -42.0, -40.0, -40.0, -40.5, -39.5, -40.0, -40.2, -39.8, -40.0]
+FALLING = [-90.0, -60.0, -30.0, -30.0, -30.0, -30.0, -33.0, -36.0, -39.0, -42.0, -45.0, -48.0]
+NOISY = [-90.0, -60.0, -30.0, -50.0, -20.0, -60.0, -30.0, -50.0, -20.0, -60.0, -30.0, -40.0]
+HEALTHY: dict[str, Any] = {
+    "average_reward": RISING,
+    "kl": 0.6,
+    "kl_bound": 1.0,
+    "eta": 0.3,
+    "effective_samples": 500.0,
+    "samples": 1000,
+    "weighted": 1600,
+    "rank": 180,
+    "rank_residual": 9e-7,
+    "gap": 1e-8,
+    "outcome": "BOUND_ACTIVE",
+    "jitter": 0.0,
+    "model_error": 0.2,
+    "clipped": 0.3,
+    "eta_floor": 0.1,
+    "policy_noise": 0.4,
+    "max_rank": 400,
+}
+
+
+def rows(count: int = 12, **changes: Any) -> list[dict[str, str]]:
+    """Rows of ``progress.csv``; a list is taken from its start, anything else for every row."""
+    found = []
+    for i in range(count):
+        row: dict[str, Any] = dict.fromkeys(COLUMNS, 0.0)
+        row |= {"iteration": i + 1, "rollouts": 30 + 10 * i, "steps": 1500 + 500 * i}
+        for name, value in {**HEALTHY, **changes}.items():
+            row[name] = value[i] if isinstance(value, list) else value
+        found.append({name: str(value) for name, value in row.items()})
+    return found
+
+
+def finding(name: str, evaluation: Any = None, references: Any = None, **changes: Any) -> Finding:
+    found = diagnose(rows(**changes), evaluation, references)
+    (one,) = [f for f in found if f.name == name]
+    return one
+
+
+def evaluation(stochastic: float, greedy: float) -> dict[str, Any]:
+    return {"iteration": 12, "stochastic": {"mean": stochastic}, "greedy": {"mean": greedy}}
+
+
+# ---- trends -----------------------------------------------------------------------------------
+
+
+def test_a_trend_is_the_rise_over_the_last_half() -> None:
+    found = trend(np.array([9.0, 9.0, 9.0, 9.0, 1.0, 2.0, 3.0, 4.0]))
+    assert found is not None
+    assert found.iterations == 4 and found.rise == pytest.approx(3.0)
+    assert found.error == pytest.approx(0.0, abs=1e-12)
+    assert found.rises() and not found.falls() and not found.rises(3.1) and found.below(3.1)
+
+
+def test_the_error_of_a_trend_has_the_confidence_it_claims() -> None:
+    rng = np.random.default_rng(0)
+    found = [trend(rng.normal(size=12)) for _ in range(4000)]
+    share = np.mean([t is not None and t.rises() for t in found])
+    assert share == pytest.approx(1.0 - diagnosis.CONFIDENCE, abs=0.012)
+
+
+def test_what_never_changes_neither_rises_nor_falls() -> None:
+    assert trend(np.full(20, 0.1)) == Trend(10, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("values", [np.arange(7.0), np.array([*range(11), np.nan]), np.zeros(0)])
+def test_too_little_data_has_no_trend(values: Any) -> None:
+    assert trend(values) is None
+
+
+# ---- causes -----------------------------------------------------------------------------------
+
+
+def test_a_healthy_run_is_told_to_be_fine_in_every_respect() -> None:
+    found = diagnose(rows())
+    assert {f.name for f in found} == CAUSES - {"local optimum"}
+    assert {f.severity for f in found} == {"fine"}
+    assert all(f.remedy == "" for f in found)
+
+
+CASES: list[tuple[str, str, str, dict[str, Any]]] = [
+    (
+        "updates",
+        "limit",
+        "iteration 10",
+        {"outcome": ["AT_FLOOR"] * 9 + ["NOT_CONVERGED"] + ["AT_FLOOR"] * 2},
+    ),
+    ("updates", "note", "1 update of 12", {"outcome": ["NOT_CONVERGED"] + ["AT_FLOOR"] * 11}),
+    ("updates", "note", "1e-06", {"jitter": 1e-6}),
+    ("updates", "fine", "certified", {"jitter": 1e-14}),
+    ("updates", "fine", "certified", {"outcome": "FALLBACK"}),
+    ("progress", "fine", "still rises", {}),
+    ("progress", "limit", "falls", {"average_reward": FALLING}),
+    ("progress", "note", "cannot be told", {"average_reward": NOISY}),
+    ("progress", "limit", "100% of the KL bound", {"average_reward": LEVEL, "kl": 1.0}),
+    ("progress", "fine", "settled", {"average_reward": LEVEL, "kl": 0.1}),
+    ("progress", "note", "7 iterations: too few", {"count": 7}),
+    ("progress", "note", "1 iteration:", {"count": 1}),
+    ("step", "limit", "stopped while it learnt", {"kl": 1.0}),
+    ("step", "fine", "100%", {"kl": 1.0, "average_reward": LEVEL}),
+    ("step", "fine", "100%", {"kl": 1.0, "count": 3}),
+    (
+        "step",
+        "note",
+        "floor (0.1)",
+        {"kl": 0.1, "eta": 0.1, "outcome": "AT_FLOOR", "average_reward": LEVEL},
+    ),
+    ("step", "fine", "floor (0.1)", {"kl": 0.1, "eta": 0.1, "outcome": "AT_FLOOR"}),
+    ("step", "fine", "floor (0.1)", {"kl": 0.1, "outcome": "AT_FLOOR", "count": 3}),
+    ("step", "fine", "60%", {"kl": 0.6, "eta": 0.1, "outcome": "AT_FLOOR"}),
+    ("step", "fine", "10%", {"kl": [0.1] * 12, "outcome": ["AT_FLOOR"] * 7 + ["BOUND_ACTIVE"] * 5}),
+    ("effective samples", "limit", "29 effective", {"effective_samples": 29.0}),
+    ("effective samples", "limit", "9 effective", {"effective_samples": [500.0] * 7 + [9.0] * 5}),
+    ("effective samples", "note", "4.0%", {"effective_samples": 64.0}),
+    ("effective samples", "fine", "81 effective", {"effective_samples": 81.0}),
+    ("transition model", "limit", "does not fall", {"model_error": 0.8}),
+    ("transition model", "limit", "it falls", {"model_error": list(np.linspace(2.0, 0.9, 12))}),
+    ("transition model", "note", "does not fall", {"model_error": 0.5}),
+    ("transition model", "note", "0.50", {"model_error": 0.5, "count": 2}),
+    ("transition model", "fine", "0.39", {"model_error": 0.39}),
+    ("basis of V", "limit", "400", {"rank": 400, "rank_residual": 0.6}),
+    ("basis of V", "note", "max_rank=800", {"rank": 400, "rank_residual": 0.2}),
+    ("basis of V", "fine", "is little", {"rank": 400, "rank_residual": 0.01}),
+    ("basis of V", "fine", "Complete", {"rank": 399, "rank_residual": 0.9}),
+    (
+        "exploration noise",
+        "limit",
+        "hardly anything",
+        {"policy_noise": 0.01, "average_reward": LEVEL},
+    ),
+    ("exploration noise", "note", "hardly anything", {"policy_noise": 0.01}),
+    ("exploration noise", "note", "1.2", {"policy_noise": 1.2}),
+    ("exploration noise", "fine", "0.4", {"evaluation": evaluation(-31.0, -30.0)}),
+    ("exploration noise", "note", "costs 10", {"evaluation": evaluation(-40.0, -30.0)}),
+    ("clipped actions", "note", "97%", {"clipped": 0.97}),
+    ("clipped actions", "fine", "89%", {"clipped": 0.89}),
+]
+
+
+@pytest.mark.parametrize(("name", "severity", "says", "changes"), CASES)
+def test_each_cause_is_judged_and_said(
+    name: str, severity: str, says: str, changes: dict[str, Any]
+) -> None:
+    found = finding(name, **changes)
+    assert found.severity == severity
+    assert says in f"{found.sentence} {found.remedy}"
+    assert found.sentence.endswith(".") and found.sentence[0] == found.sentence[0].upper()
+    assert bool(found.remedy) == (severity != "fine")
+
+
+def test_every_value_stands_to_its_limit_as_the_severity_says() -> None:
+    above = {"transition model": {"model_error": 0.9}, "clipped actions": {"clipped": 0.95}}
+    for name, changes in above.items():
+        assert finding(name, **changes).value >= finding(name, **changes).limit
+        assert finding(name).value < finding(name).limit
+    few = finding("effective samples", effective_samples=9.0)
+    assert few.value < few.limit == diagnosis.LEAST_EFFECTIVE
+
+
+def test_one_bad_iteration_is_not_a_cause() -> None:
+    assert finding("transition model", model_error=[0.2] * 11 + [0.9]).severity == "fine"
+    assert finding("effective samples", effective_samples=[500.0] * 11 + [9.0]).severity == "fine"
+
+
+def test_settings_that_remedies_name_exist() -> None:
+    named = [
+        word.strip("().,;").partition("=")
+        for name, _, _, changes in CASES
+        for before, word in pairwise(finding(name, **changes).remedy.split())
+        if before.strip("(") == "--set"
+    ]
+    assert len(named) > 20
+    for setting, equals, value in named:
+        assert equals == "="
+        Settings(**{setting: float(value) if "." in value or "e" in value else int(value)})
+
+
+@pytest.mark.parametrize(("floor", "higher"), [(0.1, "0.2"), (0.4, "0.8"), (1e-6, "0.1")])
+def test_a_higher_floor_is_higher_than_it_was(floor: float, higher: str) -> None:
+    found = finding("progress", average_reward=LEVEL, kl=1.0, eta_floor=floor)
+    assert f"--set eta_floor={higher})" in found.remedy
+
+
+def test_a_known_local_optimum_is_named_by_the_evaluation() -> None:
+    stuck = evaluation(-62.5, -62.0)
+    found = finding("local optimum", stuck, REFERENCES, average_reward=LEVEL)
+    assert found.severity == "limit" and found.limit == -61.9 and found.value == -62.0
+    assert "the lean" in found.sentence and "--seed" in found.remedy
+
+
+def test_a_known_local_optimum_is_named_by_the_roll_outs_too() -> None:
+    lean = [r - 22.0 for r in LEVEL]
+    assert diagnose(rows(average_reward=lean), None, REFERENCES)[0].name == "local optimum"
+
+
+@pytest.mark.parametrize(
+    ("reward", "references", "changes"),
+    [
+        (-62.0, REFERENCES, {}),  # the reward rises: it passes by
+        (-62.0, {}, {"average_reward": LEVEL}),
+        (-50.0, REFERENCES, {"average_reward": LEVEL}),
+        (-21.5, REFERENCES, {"average_reward": LEVEL}),  # the optimum is no local one
+        (-101.0, REFERENCES, {"average_reward": [-100.0 - i % 2 for i in range(12)]}),
+    ],
+)
+def test_no_local_optimum_is_made_up(
+    reward: float, references: Any, changes: dict[str, Any]
+) -> None:
+    found = diagnose(rows(**changes), evaluation(reward, reward), references)
+    near = [f.sentence for f in found if f.name == "local optimum"]
+    assert all("the lean" not in sentence for sentence in near)
+
+
+def test_near_the_best_known_reward_nothing_is_stuck() -> None:
+    best = evaluation(-23.0, -22.0)
+    found = finding("progress", best, REFERENCES, average_reward=LEVEL, kl=1.0)
+    assert found.severity == "fine" and "-21.2" in found.sentence
+
+
+def test_the_gravest_come_first() -> None:
+    found = diagnose(
+        rows(model_error=0.5, clipped=0.95, effective_samples=9.0, average_reward=LEVEL)
+    )
+    severities = [f.severity for f in found]
+    assert severities == sorted(severities, key=["limit", "note", "fine"].index)
+    assert severities[0] == "limit" and severities[-1] == "fine" and "note" in severities
+
+
+def test_a_reward_that_never_changes_is_no_division_by_zero() -> None:
+    found = finding("progress", evaluation(-5.0, -5.0), average_reward=-5.0, kl=0.0)
+    assert found.severity == "fine"
+
+
+def test_causes_without_numbers_are_left_out() -> None:
+    unknown: dict[str, Any] = dict.fromkeys(NEWER, "nan")
+    missing = {"transition model", "basis of V", "exploration noise", "clipped actions"}
+    assert {f.name for f in diagnose(rows(**unknown))} == CAUSES - missing - {"local optimum"}
+    found = finding("step", **unknown | {"kl": 0.1, "outcome": "AT_FLOOR"})
+    assert "nan" not in found.sentence
+    without_model = diagnose(rows(model_error="nan"))
+    assert "transition model" not in {f.name for f in without_model}
+
+
+def test_the_share_is_of_the_samples_that_were_given_weights() -> None:
+    shares = diagnosis.effective_share(rows(2, weighted=["nan", 2000.0], samples=1000.0))
+    np.testing.assert_allclose(shares, [0.5, 0.25])
+
+
+def test_iterations_that_have_the_numbers_are_used() -> None:
+    assert finding("transition model", model_error=["nan"] * 10 + [0.5, 0.7]).value == 0.6
+
+
+# ---- run folders ------------------------------------------------------------------------------
+
+
+def write_run(path: Path, content: list[dict[str, str]], without: tuple[str, ...] = ()) -> Path:
+    RunFolder(path).create(RunConfig(NAME, 12, 0, "default", {}, None))
+    names = [name for name in COLUMNS if name not in without]
+    with (path / "progress.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, names, extrasaction="ignore")
+        writer.writeheader()
+        writer.writerows(content)
+    return path
+
+
+def test_files_of_earlier_versions_are_read(tmp_path: Path) -> None:
+    found = RunFolder(write_run(tmp_path, rows(), without=NEWER)).rows()
+    assert len(found) == 12
+    assert all(set(row) == set(COLUMNS) for row in found)
+    assert {row[name] for row in found for name in NEWER} == {"nan"}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "good"),
+    [
+        ("model_error", "nan", True),
+        ("model_error", "inf", False),
+        ("model_error", "word", False),
+        ("kl", "nan", False),
+    ],
+)
+def test_only_what_may_be_unknown_may_be_nan(
+    name: str, value: str, good: bool, tmp_path: Path
+) -> None:
+    folder = RunFolder(write_run(tmp_path, rows(**{name: value})))
+    if good:
+        assert folder.rows()[0][name] == value
+    else:
+        with pytest.raises(StorageError, match="damaged"):
+            folder.rows()
+
+
+def test_files_with_some_of_the_newer_columns_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(StorageError, match="columns"):
+        RunFolder(write_run(tmp_path, rows(), without=NEWER[:2])).rows()
+
+
+def test_a_row_has_what_the_diagnosis_needs() -> None:
+    dual = SimpleNamespace(
+        kl=0.9,
+        eta=0.2,
+        dual=0.0,
+        primal=0.0,
+        gap=0.0,
+        decrement=0.0,
+        stationarity=0.0,
+        iterations=5,
+        weights=np.full(4000, 1.0 / 4000),
+        outcome=Outcome.BOUND_ACTIVE,
+    )
+    info = SimpleNamespace(
+        dual=dual,
+        samples=1000,
+        effective_samples=300.0,
+        rank=50,
+        rank_residual=0.0,
+        support=900,
+        jitter=0.0,
+        policy_parameters=np.array([1.0, 2.0, 0.5, 0.09]),
+        model_error=float("nan"),
+        clipped=0.25,
+        eta_floor=0.1,
+        seconds={},
+    )
+    learner: Any = SimpleNamespace(settings=Settings(max_rank=70))
+    told: Any = SimpleNamespace(
+        iteration=1, rollouts=30, steps=1000, average_reward=-1.0, update=info, rollout_seconds=0.1
+    )
+    row = progress_row(learner, told)
+    assert set(row) == set(COLUMNS) and row["weighted"] == 4000
+    assert row["policy_noise"] == pytest.approx(0.3) and row["max_rank"] == 70
+    assert row["clipped"] == 0.25 and row["eta_floor"] == 0.1 and np.isnan(row["model_error"])
+
+
+# ---- the page ---------------------------------------------------------------------------------
+
+
+def page(changes: dict[str, Any], references: Any = None) -> tuple[Figure, list[Finding]]:
+    content = rows(**changes)
+    found = diagnose(content, None, references)
+    return diagnosis_page.page(content, found, references or {}, "a run"), found
+
+
+def panels(figure: Figure) -> dict[str, Any]:
+    return {axes.get_title(loc="left"): axes for axes in figure.axes}
+
+
+def words(figure: Figure) -> list[Any]:
+    return list(figure.subfigs[1].texts)
+
+
+BAD: dict[str, Any] = {
+    "average_reward": LEVEL,
+    "kl": 1.0,
+    "model_error": 0.9,
+    "clipped": 0.95,
+    "effective_samples": 9.0,
+    "rank": 400,
+    "rank_residual": 0.6,
+    "policy_noise": 0.01,
+    "jitter": 1e-5,
+}
+
+
+def test_the_panels_show_the_numbers_and_their_thresholds() -> None:
+    figure, _ = page({})
+    shown = panels(figure)
+    assert list(shown) == list(diagnosis_page.PANELS)
+    wanted: dict[str, tuple[float, list[float]]] = {
+        "KL": (0.6, [1.0, 0.5]),
+        "Temp": (0.3, [0.1]),
+        "Eff": (500.0 / 1600.0, [diagnosis.LEAST_SHARE]),
+        "Model": (0.2, [diagnosis.ERROR_NOTE, diagnosis.ERROR_LIMIT]),
+        "Basis": (180.0, [400.0]),
+        "Policy": (0.4, [diagnosis.NOISE_LEAST, diagnosis.NOISE_MOST]),
+        "Comm": (0.3, [diagnosis.CLIPPED_NOTE]),
+    }
+    for start, (value, lines) in wanted.items():
+        (axes,) = [axes for title, axes in shown.items() if title.startswith(start)]
+        curve, *others = axes.lines
+        np.testing.assert_allclose(curve.get_ydata(), value)
+        np.testing.assert_array_equal(curve.get_xdata(), np.arange(1, 13))
+        levels = [float(np.asarray(line.get_ydata())[0]) for line in others]
+        assert levels == lines
+        low, high = axes.get_ylim()
+        assert all(low < level < high for level in [value, *lines])
+
+
+def test_the_reward_is_drawn_with_its_references_and_its_trend() -> None:
+    figure, _ = page({}, REFERENCES)
+    axes = figure.axes[0]
+    curve, *others = axes.lines
+    np.testing.assert_allclose(curve.get_ydata(), RISING)
+    levels = {float(np.asarray(line.get_ydata())[0]) for line in others}
+    assert set(list(REFERENCES.values())[:-1]) <= levels
+    ends = np.asarray(others[-1].get_ydata())
+    np.testing.assert_allclose(ends, [RISING[6], RISING[-1]])
+
+
+@pytest.mark.parametrize("changes", [{}, BAD], ids=["healthy", "bad"])
+def test_every_panel_is_marked_with_its_gravest_finding(changes: dict[str, Any]) -> None:
+    figure, found = page(changes)
+    for title, axes in panels(figure).items():
+        mine = [f.severity for f in found if f.name in diagnosis_page.PANELS[title]]
+        gravest = min(mine, key=["limit", "note", "fine"].index)
+        assert axes.get_title(loc="right") == f"● {gravest}"
+    shown = {name for names in diagnosis_page.PANELS.values() for name in names}
+    assert shown == CAUSES
+
+
+@pytest.mark.parametrize("changes", [{}, BAD], ids=["healthy", "bad"])
+def test_the_page_holds_every_word_and_none_runs_out_of_it(changes: dict[str, Any]) -> None:
+    figure, found = page(changes, REFERENCES)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    texts = words(figure)
+    said = " ".join(" ".join(t.get_text() for t in texts).split())
+    for f in found:
+        for part in (f.sentence, f.remedy):
+            assert " ".join(part.split()) in said
+    boxes = [t.get_window_extent(canvas.get_renderer()) for t in texts]
+    drawn = figure.subfigs[1].bbox
+    for box, below in zip(boxes, [*boxes[1:], None], strict=True):
+        assert drawn.x0 <= box.x0 and box.x1 <= drawn.x1
+        assert figure.bbox.y0 < box.y0 and box.y1 < figure.bbox.y1
+        assert below is None or below.y1 < box.y1
+    assert min(t.get_fontsize() for t in texts) >= 7.5
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"count": 1},
+        {"count": 2},
+        dict.fromkeys(NEWER, "nan"),
+        {"eta": 1e-6, "eta_floor": 1e-6, "kl": 0.0},
+        {"average_reward": 0.0},
+        {"clipped": 0.0, "policy_noise": 1e-5},
+    ],
+)
+def test_any_run_has_a_page(changes: dict[str, Any], tmp_path: Path) -> None:
+    before = dict(rcParams)
+    figure, _ = page(changes, REFERENCES)
+    with Image.open(plotting.save(figure, tmp_path / "page.png")) as picture:
+        picture.load()
+        assert picture.size == (2100, 1320)
+    assert dict(rcParams) == before
+
+
+def test_panels_without_numbers_say_so() -> None:
+    figure, _ = page(dict.fromkeys(NEWER, "nan"))
+    silent = [
+        title
+        for title, axes in panels(figure).items()
+        if any("not recorded" in t.get_text() for t in axes.texts)
+    ]
+    assert [title.split()[0] for title in silent] == ["Model:", "Policy", "Commands"]
+
+
+# ---- the command ------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def call(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str]]:
+    def _call(*arguments: str | Path) -> tuple[int, str]:
+        monkeypatch.setattr("sys.argv", ["kreps", *map(str, arguments)])
+        monkeypatch.setenv("COLUMNS", "400")
+        with pytest.raises(SystemExit) as stop:
+            cli.main()
+        printed = capsys.readouterr()
+        return int(stop.value.code or 0), " ".join((printed.out + printed.err).split())
+
+    return _call
+
+
+Call = Callable[..., tuple[int, str]]
+
+
+def test_diagnose_says_everything_and_draws_it(call: Call, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run[a]", rows(**{**BAD, "count": 7}))
+    (run / "evaluation.json").write_text(json.dumps(evaluation(-62.0, -62.0) | {"iteration": 7}))
+    code, text = call("diagnose", run)
+    assert code == 0
+    for f in report.diagnosis_of(RunFolder(run)):
+        assert f"{f.severity.capitalize()}: {f.name}. {f.sentence}" in text
+    assert "Limit: local optimum" in text  # the references and the evaluation are used
+    assert f"kreps resume {run} --iterations 20" in text and "RUN" not in text
+    assert f"drew {run / 'diagnosis.png'}" in text
+    assert (run / "diagnosis.png").stat().st_size > 20_000
+
+
+def test_runs_of_earlier_versions_are_diagnosed_as_far_as_they_go(
+    call: Call, tmp_path: Path
+) -> None:
+    code, text = call("diagnose", write_run(tmp_path / "old", rows(), without=NEWER))
+    assert code == 0 and "Fine: progress" in text and "did not record" in text
+    code, text = call("diagnose", write_run(tmp_path / "new", rows(model_error="nan")))
+    assert code == 0 and "Not judged" not in text
+
+
+def test_references_of_another_process_are_not_used(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", rows(average_reward=[r - 22.0 for r in LEVEL]))
+    folder = RunFolder(run)
+    assert "local optimum" in {f.name for f in report.diagnosis_of(folder)}
+    folder.write_config(RunConfig(NAME, 12, 0, "default", {"restart_probability": 0.1}, None))
+    assert "local optimum" not in {f.name for f in report.diagnosis_of(folder)}
+
+
+@pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
+def test_the_page_goes_where_it_is_asked_for(suffix: str, call: Call, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", rows())
+    out = tmp_path / f"page{suffix}"
+    assert call("diagnose", run, "--out", out)[0] == 0
+    assert out.stat().st_size > 10_000
+    assert not (run / "diagnosis.png").exists()
+
+
+@pytest.mark.parametrize("out", ["page.gif", "page", "missing/page.png"])
+def test_pages_that_cannot_be_written_are_refused(out: str, call: Call, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", rows())
+    code, text = call("diagnose", run, "--out", tmp_path / out)
+    assert code == 2 and "error:" in text and Path(out).name in text
+
+
+def test_folders_that_hold_nothing_to_diagnose_are_refused(call: Call, tmp_path: Path) -> None:
+    for place in (tmp_path, tmp_path / "missing"):
+        code, text = call("diagnose", place)
+        assert code == 2 and "not a run folder" in text and "kreps train" in text
+    run = write_run(tmp_path / "run", [])
+    code, text = call("diagnose", run)
+    assert code == 2 and "no iteration yet" in text and f"kreps resume {run}" in text
+    (run / "progress.csv").unlink()
+    assert call("diagnose", run)[0] == 2
+    (run / "progress.csv").write_text("iteration,foo\n1,2\n")
+    code, text = call("diagnose", run)
+    assert code == 2 and "damaged" in text
+
+
+def test_the_help_teaches(call: Call) -> None:
+    code, text = call("diagnose", "--help")
+    assert code == 0
+    assert "kreps diagnose runs/swing-up" in text
+    assert all(word in text for word in ("limit", "note", "fine", "effective samples"))
+
+
+def test_the_end_of_a_run_tells_the_three_gravest(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = write_run(tmp_path / "run", rows(**BAD))
+    report._say_limits(RunFolder(run))
+    text = capsys.readouterr().out
+    assert text.count("Try:") == 3 and "Fine:" not in text
+    assert f"kreps diagnose {run}" in " ".join(text.split())
+    good = write_run(tmp_path / "good", rows())
+    report._say_limits(RunFolder(good))
+    text = " ".join(capsys.readouterr().out.split())
+    assert "Nothing stands out" in text and f"kreps diagnose {good}" in text
+
+
+# ---- the documentation ------------------------------------------------------------------------
+
+PAGE = (Path(__file__).resolve().parents[1] / "docs/diagnosis.md").read_text()
+
+
+def test_the_page_of_the_documentation_explains_every_finding() -> None:
+    headings = [line.removeprefix("## ") for line in PAGE.splitlines() if line.startswith("## ")]
+    assert set(headings[:-1]) == CAUSES
+    for section in PAGE.split("\n## ")[1:-1]:
+        assert "*Why.*" in section and "*Try*" in section
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("RECENT", "last {:g} iterations"),
+        ("LEAST_ROWS", "below {:g} iterations"),
+        ("CONFIDENCE", "confidence of {:.0%}"),
+        ("JITTER_NOTE", "jitter above {:g}"),
+        ("LEAST_RISE", "from {:.0%} of the range"),
+        ("BOUND_USED", "use {:.0%} or more"),
+        ("LEAST_EFFECTIVE", "below {:g} effective samples"),
+        ("LEAST_SHARE", "below {:.0%} of all"),
+        ("ERROR_NOTE", "**note** from {:g}, **limit** from"),
+        ("ERROR_LIMIT", "**limit** from {:g}. Left"),
+        ("RESIDUAL_NOTE", "residual of {:g}"),
+        ("RESIDUAL_LIMIT", "**limit** from\n{:g}"),
+        ("NOISE_LEAST", "below {:g} (**note**"),
+        ("NOISE_MOST", "**note** above {:g}"),
+        ("CLIPPED_NOTE", "if {:.0%} or more of the commands"),
+    ],
+)
+def test_the_thresholds_of_the_documentation_are_those_of_the_code(name: str, text: str) -> None:
+    said = text.format(getattr(diagnosis, name)).replace("%", " %").replace("1e-08", "1e-8")
+    assert " ".join(said.split()) in " ".join(PAGE.split())
