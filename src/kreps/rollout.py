@@ -101,8 +101,9 @@ class Noise(Protocol):
 class HeldNoise:
     """Standard normal noise of which each coordinate stays the same for a random time.
 
-    White noise averages out over a few steps, so that slow systems hardly move.  How long a slow
-    one needs is not known beforehand, so each roll-out draws its own mean time.
+    White noise averages out over a few steps, so that a system with some inertia hardly leaves its
+    start.  How long it has to be pushed is not known beforehand, so each roll-out draws its own
+    mean time.
 
     Args:
         rng: of the noise.
@@ -138,7 +139,8 @@ def collect(
     """``count`` roll-outs of random length, as the paper's protocol collects them.
 
     Args:
-        held_share: share of the roll-outs whose noise is held, evenly among them.
+        held_share: share of the roll-outs whose noise is held, evenly among them; for a mean time
+            of at most the root of a roll-out's length, so that each tries several actions.
         on_rollout: called with the number of roll-outs that are complete.
 
     Raises:
@@ -150,7 +152,7 @@ def collect(
     for j in range(count):
         if int((j + 1) * held_share) > int(j * held_share):
             rng = generator(seed, Purpose.POLICY, iteration, j)
-            noises[j] = HeldNoise(rng, 1.0 / restart_probability)
+            noises[j] = HeldNoise(rng, restart_probability**-0.5)
     lengths = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
     return simulate(env, task, policy, seeds, noises, lengths, on_rollout)
 

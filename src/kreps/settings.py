@@ -68,8 +68,9 @@ class OnPolicySettings(LearnerSettings):
     Attributes:
         exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``.
         exploration_scale: standard deviation of the Gaussian one, in units of half the range.
-        held_share: share of the first roll-outs whose noise is held for a random time, from one
-            step to the length of a roll-out: white noise hardly moves a slow system.
+        held_share: share of the first roll-outs whose noise is held for a random time, on average
+            from one step to the root of a roll-out's length: white noise hardly moves what has
+            some inertia.
         initial_rollouts: roll-outs of the first policy.
         rollouts_per_iteration: roll-outs of the current policy before each later update.
     """

@@ -116,25 +116,36 @@ def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
     return markdown([*TABLE_HEADINGS, "iterations", "CPU s / update"], rows)
 
 
-MARKS = (2000, 3000, 5000, 8000, 10_000)
+MARKS = (2000, 3000, 5000, 6000, 8000, 20_000)
 """Environment steps at which learning curves are read off."""
 
 
+def at_most(curve: Sequence[Mapping[str, Any]], steps: float) -> Mapping[str, Any]:
+    """The row of the last policy that was learnt from at most so many steps (or of the first)."""
+    rows = sorted(curve, key=lambda row: float(row["steps"]))
+    return [rows[0], *(row for row in rows if float(row["steps"]) <= steps)][-1]
+
+
+def read_off(curves: Sequence[Sequence[Mapping[str, Any]]], name: str, mark: float) -> str:
+    """Mean and, in brackets, worst seed at a mark; a dash where the curves end before it."""
+    ends = [max(float(row["steps"]) for row in curve) for curve in curves]
+    if np.mean(ends) < 0.95 * mark:
+        return "–"
+    values = [float(at_most(curve, mark)[name]) for curve in curves]
+    places = 1 if min(values) < -10.0 else 2 if min(values) < -1.0 else 3
+    return f"{np.mean(values):.{places}f} ({min(values):.{places}f})"
+
+
 def steps_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Mean and worst seed of each curve at some environment steps, between updates interpolated."""
+    """Mean and worst seed of the policies learnt from at most some numbers of steps."""
     lines = []
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row for row in rows if row["method"] == method]
+        seeds = sorted({int(row["seed"]) for row in mine})
+        curves = [[row for row in mine if int(row["seed"]) == seed] for seed in seeds]
         for name in ("stochastic", "greedy"):
-            line = [f"{method}, {name}"]
-            for mark in MARKS:
-                values = []
-                for seed in sorted({row["seed"] for row in mine}):
-                    curve = [row for row in mine if row["seed"] == seed]
-                    steps = [float(row["steps"]) for row in curve]
-                    values.append(np.interp(mark, steps, [float(row[name]) for row in curve]))
-                line.append(f"{np.mean(values):.1f} ({min(values):.1f})")
-            lines.append(line)
+            read = (read_off(curves, name, mark) for mark in MARKS)
+            lines.append([f"{method}, {name}", *read])
     return markdown(["mean (worst seed)", *(f"{mark} steps" for mark in MARKS)], lines)
 
 
@@ -143,11 +154,13 @@ TITLES = {
     "figure-1b": "Swing-up: learning progress of the methods (Fig. 1b)",
     "figure-2b": "Swing-up from images and from joint values (Fig. 2b)",
     "swing-up": "kreps/SwingUp-v0: every seed",
-    "defaults": "One configuration, three tasks: every seed",
+    "untuned": "KREPS(env) and nothing else: every seed",
+    "ablation": "Each part of the default taken back alone: every seed",
     "low-rank": "Exact and of low rank: every seed",
     "forgetting": "Swing-up with and without a window of 30 roll-outs",
 }
-SEED_BY_SEED = ("swing-up", "defaults", "low-rank")
+SEED_BY_SEED = ("swing-up", "untuned", "ablation", "low-rank")
+STEP_BY_STEP = ("swing-up", "untuned", "ablation")
 
 
 def write_figure(
@@ -158,7 +171,7 @@ def write_figure(
 
     write_results(folder, name, command, results)
     rows = named_rows(rows_of(results))
-    if name == "swing-up":
+    if name in STEP_BY_STEP:
         write_atomically(folder / f"{name}-steps.md", (steps_table(rows) + "\n").encode())
     references = {
         row["method"]: REFERENCE_REWARDS.get(TASKS[row["task"]].environment, {}) for row in rows
