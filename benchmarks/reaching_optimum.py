@@ -1,10 +1,10 @@
 """The optimum of the reaching task by direct optimal control: what learners are measured against.
 
-    python benchmarks/reaching_optimum.py --steps 30 --starts 4
+    python benchmarks/reaching_optimum.py --steps 40 --starts 3
 
 The task is deterministic, so its optimum is one sequence of torques over the first ``--steps``
 periods (none are needed once the arm rests at the target).  It has many local optima, and random
-starts find poor ones.  So the search starts from what greedy policies of value iteration do, one
+starts find poor ones.  So the search starts from what greedy policies of kernel REPS do, one
 learner a start, and goes on by L-BFGS-B with central differences.  That is a best known value, not
 a proven optimum.  Writes ``results/reaching-optimum.json``.
 """
@@ -20,7 +20,7 @@ import gymnasium as gym
 import numpy as np
 from scipy.optimize import minimize
 
-from kreps import ValueIteration
+from kreps import KREPS
 from kreps.arrays import FloatArray
 from kreps.envs.reaching import MAX_TORQUE, ReachingBatch
 from kreps.evaluation import Greedy, evaluation_rollouts
@@ -69,15 +69,14 @@ def learnt_torques(seed: int, steps: int) -> FloatArray:
         torques = np.clip(rollout.actions, -MAX_TORQUE, MAX_TORQUE)
         found.append((float(average_rewards(torques[None], SEARCHED)[0]), torques[:steps].ravel()))
 
-    learner = ValueIteration(env, seed=seed, exploration="gaussian", exploration_scale=0.05)
-    learner.learn(8, callback=keep, progress=False)
+    KREPS(env, seed=seed).learn(12, callback=keep, progress=False)
     return max(found, key=lambda pair: pair[0])[1]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=30)
-    parser.add_argument("--starts", type=int, default=4)
+    parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--starts", type=int, default=3)
     parser.add_argument("--out", type=Path, default=Path("results"))
     options = parser.parse_args()
     found: list[FloatArray] = []
