@@ -13,6 +13,7 @@ from kreps.algorithms.reps import feature_differences
 from kreps.algorithms.transition_model import state_kernel, successor_features
 from kreps.arrays import FloatArray
 from kreps.dual import DualProblem, Moments, solve_dual, standardise
+from kreps.settings import RECIPES
 from kreps.value import RKHSBasis
 
 
@@ -52,7 +53,7 @@ def bench_newton_iteration(measure: Measure, n: int) -> None:
 def bench_newton_solve(measure: Measure) -> None:
     """From a cold start, on features and rewards of the swing-up."""
     data = swing_up(1500)
-    learner, transitions = data.learner, data.transitions
+    learner, transitions, observed = data.learner, data.transitions, RECIPES["observed"]
     kernel = state_kernel(transitions, learner.task, np.random.default_rng(0))
     basis, features = RKHSBasis.fit(kernel, transitions.points, tolerance=0.0, max_rank=300)
     assert features.shape[1] == 300, basis.residual
@@ -60,9 +61,9 @@ def bench_newton_solve(measure: Measure) -> None:
     problem = DualProblem(
         rewards,
         feature_differences(transitions, features, successor_features(transitions, features), 0.02),
-        learner.settings.kl_bound,
-        learner.settings.ridge / len(rewards),
-        learner.settings.eta_floor,
+        observed.kl_bound,
+        (observed.ridge or 0.0) / len(rewards),
+        observed.eta_floor,
     )
     count = hessians(problem)
     measured = measure(

@@ -42,7 +42,7 @@ from kreps.embedding import KernelEmbedding
 from kreps.envs.restart import restart_length
 from kreps.plotting import BLUE, GREY, ORANGE, STYLE
 from kreps.policies import CostSensitiveGP, Gaussian, StochasticPolicy
-from kreps.settings import Settings
+from kreps.settings import settings_of
 from kreps.value import KernelExpansion, RKHSBasis
 
 NOTEBOOK = "ipykernel" in sys.modules
@@ -71,7 +71,7 @@ PERIOD, NOISE, GAMMA = 0.3, 0.25, 15 / 16
 task = TaskSpec(
     observation_size=1, action_low=np.array([-2.0]), action_high=np.array([2.0]), periodic=(0,)
 )
-settings = Settings(restart_probability=1.0 - GAMMA)
+settings = settings_of("observed", restart_probability=1.0 - GAMMA)
 
 
 def wrap(angle: FloatArray) -> FloatArray:

@@ -36,6 +36,7 @@ from kreps.kernels import (
 from kreps.linalg import cholesky, solve_lower, solve_lower_transposed, with_diagonal
 from kreps.policies import BangBang
 from kreps.rollout import collect
+from kreps.settings import settings_of
 from kreps.sparse_gp import PolicySums
 from kreps.value import Basis, FourierBasis, RBFGrid, RKHSBasis
 
@@ -281,6 +282,7 @@ def streamed(monkeypatch: pytest.MonkeyPatch) -> None:
 def updated(
     rollouts: list[Rollout], place: Callable[[FloatArray], Array] = as_float, **settings: Any
 ) -> tuple[kreps.KREPS, UpdateInfo]:
+    settings = {"recipe": "observed", **settings}
     learner = kreps.KREPS(TASK, compute=Compute(to_device=place), **settings)
     info = learner.update(rollouts)
     assert isinstance(info, UpdateInfo)
@@ -321,6 +323,7 @@ VARIANTS: list[dict[str, Any]] = [
     {"features": "grid", "grid_size": 6},
     {"approximation": "fourier"},
     {"approximation": "uniform", "rank": 60},
+    {"recipe": "default"},
 ]
 
 
@@ -348,8 +351,7 @@ def test_an_update_in_another_library_is_the_same(
 @pytest.mark.usefixtures("streamed")
 def test_an_update_from_images_in_another_library_is_the_same() -> None:
     env = gym.make("kreps/ImageSwingUp-v0")
-    learner = kreps.KREPS(env, recipe="images")
-    task = learner.task
+    task = kreps.KREPS(env).task
     given = collect(
         env.unwrapped,  # type: ignore[arg-type]
         task,
@@ -360,9 +362,11 @@ def test_an_update_from_images_in_another_library_is_the_same() -> None:
         restart_probability=0.02,
     )
     weights = []
+    # the numbers that the search chose for images
+    settings = settings_of("observed", kl_bound=0.5, ridge=0.01, eta_floor=0.02)
     for place in (as_float, strict):
         learner = kreps.KREPS(
-            task, recipe="images", approximation="pivoted", compute=Compute(to_device=place)
+            task, recipe=settings, approximation="pivoted", compute=Compute(to_device=place)
         )
         weights.append(learner.update(given).dual.weights)  # type: ignore[attr-defined]
     assert len(weights[0]) > 200

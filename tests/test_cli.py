@@ -241,7 +241,7 @@ def test_an_empty_folder_may_be_used(tmp_path: Path) -> None:
         (["SwingUp"], "SwingUp"),
         ([""], "environment"),
         (["CartPole-v1"], "Discrete(2)"),
-        ([NAME, "--recipe", "cake"], "'default', 'paper'"),
+        ([NAME, "--recipe", "cake"], "'default', 'observed', 'paper'"),
         ([NAME, "--set", "kl_bound"], "NAME=VALUE"),
         ([NAME, "--set", "kl_bound=wide"], "kl_bound = 'wide'"),
         ([NAME, "--set", "kl_bound=-1"], "kl_bound = -1"),

@@ -12,11 +12,12 @@ from pathlib import Path
 import pytest
 
 from kreps.experiments.claims import claims_table, write_claims
-from kreps.experiments.figures import markdown_table, steps_table
+from kreps.experiments.figures import markdown_table, named_rows, steps_table
 from kreps.experiments.search import search_table
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "docs"))
+sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "benchmarks")]
+import peers_table  # noqa: E402
 from fill_tables import filled  # noqa: E402
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -76,7 +77,10 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
         table = (ROOT / "results" / f"{name}.md").read_text().strip()
         if name.endswith("-steps"):
             with open(ROOT / "results" / f"{name.removesuffix('-steps')}.csv", newline="") as file:
-                assert table == steps_table(list(csv.DictReader(file)))
+                assert table == steps_table(named_rows(list(csv.DictReader(file))))
+            continue
+        if name == "peers":
+            assert table == peers_table.table()
             continue
         folder = ROOT / ("src/kreps/experiments" if name == "search" else "results")
         content = json.loads((folder / f"{name}.json").read_text())

@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from kreps.arrays import FloatArray
-from kreps.embedding import FeatureRegression, KernelEmbedding, RegressionSums, SampleModel
+from kreps.embedding import (
+    FeatureRegression,
+    KernelEmbedding,
+    LeaveOneOut,
+    RegressionSums,
+    SampleModel,
+)
 from kreps.kernels import Kernel, Periodic, SquaredExponential, factors_of
 from kreps.value import Basis, FourierBasis, RKHSBasis
 
@@ -104,7 +110,73 @@ def test_the_conditional_expectation_is_learnt_from_noisy_successors() -> None:
     assert many[0] < 0.1 * many[2]
 
 
+@pytest.mark.parametrize("regulariser", [1e-3, 0.1, 1.0])
+def test_leave_one_out_errors_are_those_of_refits(regulariser: float) -> None:
+    model, targets = fitted(25, 14, regulariser)
+    wanted = []
+    for i in range(25):
+        rest = np.arange(25) != i
+        refit = KernelEmbedding.fit(model.kernel, model.inputs[rest], regulariser)
+        prediction = refit.strengths(model.inputs[i : i + 1]).T @ targets[rest]
+        wanted.append(targets[i] - prediction[0])
+    found = model.leave_one_out(targets)
+    np.testing.assert_array_equal(found.targets, targets)
+    np.testing.assert_allclose(found.errors, wanted, atol=1e-9)
+    squares = np.sum(np.square(wanted), axis=1)
+    assert found.mean_square == pytest.approx(squares.mean())
+    assert found.relative == pytest.approx(np.sqrt(squares.sum() / np.sum(targets**2)))
+
+
+def test_the_relative_error_of_a_model_that_says_nothing_is_one() -> None:
+    targets = np.random.default_rng(15).normal(size=(7, 3))
+    assert LeaveOneOut(targets, targets).relative == pytest.approx(1.0)
+    assert LeaveOneOut(targets, np.zeros((7, 3))).relative == 0.0
+    nothing = np.zeros((7, 3))
+    assert (LeaveOneOut(nothing, nothing).relative, LeaveOneOut(nothing, nothing).mean_square) == (
+        0.0,
+        0.0,
+    )
+
+
+@pytest.mark.parametrize("regulariser", [1e-3, 1.0])
+def test_the_predictor_goes_on_from_what_is_expected_at_the_samples(regulariser: float) -> None:
+    model, targets = fitted(40, 16, regulariser)
+    predict = model.predictor(targets)
+    np.testing.assert_allclose(predict(model.inputs), model.expected_features(targets), atol=1e-9)
+    queries = np.random.default_rng(17).normal(size=(9, 3))
+    np.testing.assert_allclose(predict(queries), model.strengths(queries).T @ targets, atol=1e-9)
+    far = np.array([[0.0, 80.0, 0.0]])
+    np.testing.assert_array_equal(predict(far), np.zeros((1, 6)))  # it fades to its origin
+
+
 # In features of states and actions
+
+
+@pytest.mark.parametrize("copies", [1, 4])
+@pytest.mark.parametrize("regulariser", [1e-3, 1.0])
+def test_leave_one_out_errors_of_a_regression_are_those_of_refits(
+    regulariser: float, copies: int
+) -> None:
+    """Of samples that stand for ``copies`` each, one of which is left out."""
+    rng = np.random.default_rng(18)
+    psi, targets = rng.normal(size=(20, 6)), rng.normal(size=(20, 3))
+    wanted = []
+    for i in range(20):
+        count = np.full(20, float(copies))
+        count[i] -= 1.0
+        gram = psi.T @ (count[:, None] * psi) + regulariser * np.eye(6)
+        coefficients = np.linalg.solve(gram, psi.T @ (count[:, None] * targets))
+        wanted.append(targets[i] - psi[i] @ coefficients)
+    found = FeatureRegression.leave_one_out(psi, targets, regulariser, float(copies))
+    np.testing.assert_array_equal(found.targets, targets)
+    np.testing.assert_allclose(found.errors, wanted, atol=1e-9)
+
+
+def test_leave_one_out_errors_on_all_features_are_those_of_the_embedding() -> None:
+    model, targets = fitted(40, 19, 0.05)
+    _, psi = RKHSBasis.fit(model.kernel, model.inputs, tolerance=1e-14, max_rank=40)
+    found = FeatureRegression.leave_one_out(psi, targets, 0.05)
+    np.testing.assert_allclose(found.errors, model.leave_one_out(targets).errors, atol=1e-8)
 
 
 @pytest.mark.parametrize("regulariser", [1e-2, 1.0])

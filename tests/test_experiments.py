@@ -13,6 +13,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+import kreps
 from kreps.errors import CellFailure, ConfigurationError, StorageError
 from kreps.experiments import claims, search
 from kreps.experiments.cells import (
@@ -38,7 +39,6 @@ from kreps.experiments.figures import (
 from kreps.experiments.runner import figure_cells, run_cells
 from kreps.experiments.specs import FIGURES, METHODS, TASKS
 from kreps.learner import LEARNERS
-from kreps.settings import RECIPES, settings_of
 
 TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 
@@ -67,8 +67,10 @@ class Inline(Executor):
 
 def test_cells_are_each_curve_with_each_seed_from_zero() -> None:
     cells = figure_cells("swing-up", 3, None)
+    methods = [method for _, method in FIGURES["swing-up"]]
+    assert {"kreps (default)", "paper-like"} <= set(methods)
     assert [(c.method, c.seed) for c in cells] == [
-        (method, seed) for seed in range(3) for method in ("kreps (default)", "paper-like")
+        (method, seed) for seed in range(3) for method in methods
     ]
     assert {c.iterations for c in cells} == {20}
     assert len({c.name for c in cells}) == len(cells)
@@ -176,7 +178,26 @@ def test_the_committed_search_is_of_the_candidates_of_today() -> None:
             assert found["chosen"] == candidates[int(np.argmax(means))]
             assert search.tuned_options(task, method) == found["chosen"]
     assert search.tuned_options("swing-up", "kreps (default)") == {}
-    assert settings_of(**search.tuned_options("images", "kernel REPS")) == RECIPES["images"]
+
+
+def test_the_candidates_mean_what_they_meant_in_the_committed_search() -> None:
+    """It was made when the recipe "observed" was the default, so that no candidate named it."""
+    numbers = {"kl_bound": 1.0, "eta_floor": 0.1, "ridge": 0.1, "imagined": 0, "held_share": 0.0}
+    for task, methods in search.CANDIDATES.items():
+        for method, candidates in methods.items():
+            if METHODS[method].learner != "reps":
+                continue
+            for cells, candidate in zip(search.search_cells(task, method), candidates, strict=True):
+                env = gym.make(cells[0].environment)
+                settings = vars(kreps.KREPS(env, **cells[0].options).settings)
+                paper = {"kl_bound": 0.5, "eta_floor": 0.02} if "recipe" in candidate else {}
+                changed = {k: v for k, v in candidate.items() if k != "recipe"}
+                wanted = numbers | paper | changed
+                assert {name: settings[name] for name in wanted} == wanted
+                printed = ("embedding", "bounded") if paper else ("change", "map")
+                if method == "REPS, sample model":
+                    printed = ("sample", printed[1])
+                assert (settings["model"], settings["policy_fit"]) == printed
 
 
 # ---- claims -----------------------------------------------------------------------------------
@@ -409,14 +430,13 @@ def test_the_features_of_the_images_are_drawn(tmp_path: Path) -> None:
 
 
 def test_cells_of_the_same_work_are_run_once(tmp_path: Path) -> None:
-    cells = [tiny(0), tiny(0, "kreps (default)"), tiny(1)]
+    same = "observed actions only"
+    cells = [tiny(0), tiny(0, same), tiny(1)]
     assert cells[0].work == cells[1].work != cells[2].work
     inline = Inline()
     results = run_cells(cells[:2], inline, tmp_path)
     assert inline.calls == 1
-    assert [row["method"] for row in rows_of(results)] == ["kernel REPS"] * 2 + [
-        "kreps (default)"
-    ] * 2
+    assert [row["method"] for row in rows_of(results)] == ["kernel REPS"] * 2 + [same] * 2
     (tmp_path / f"{cells[0].name}.json").unlink()
     assert run_cells(cells, inline, tmp_path)[:2] == results
     assert inline.calls == 2  # only the one that differs

@@ -75,10 +75,12 @@ def random_policy(task: TaskSpec, n: int = 150, noise: float = 0.2) -> kreps.Pol
 
 @pytest.fixture(scope="module")
 def learnt() -> dict[int, kreps.Policy]:
-    """Policies of the swing-up, by seed."""
+    """Policies of the swing-up, by seed: one of one step in each update, one by default."""
     return {
-        seed: kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=seed).learn(8, progress=False).policy
-        for seed in (100, 101)
+        seed: kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=seed, recipe=recipe)
+        .learn(8, progress=False)
+        .policy
+        for seed, recipe in ((100, "observed"), (101, "default"))
     }
 
 
@@ -151,8 +153,9 @@ def test_compressed_policies_are_computed_in_single_precision(
     learnt: dict[int, kreps.Policy], tmp_path: Path
 ) -> None:
     path = tmp_path / "policy.onnx"
-    for policy in learnt.values():
-        assert policy.compressed(50).export_onnx(path, "float32") == "float32"
+    # a smoother policy needs larger weights, and so fewer centres
+    for seed, centres in ((100, 50), (101, 20)):
+        assert learnt[seed].compressed(centres).export_onnx(path, "float32") == "float32"
         assert note(path)["arithmetic"] == "float32"
         assert {t.data_type for t in onnx.load(str(path)).graph.initializer} == {
             onnx.TensorProto.FLOAT,

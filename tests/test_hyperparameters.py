@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -105,6 +105,55 @@ def test_the_policy_loss_equals_that_of_refits_without_each_sample(actions: int)
         log_densities.append(np.sum(-0.5 * z**2 - np.log(sigma) - 0.5 * np.log(2.0 * np.pi)))
     wanted = -np.average(log_densities, weights=loss.weights)
     assert loss(parameters)[0] == pytest.approx(wanted, rel=1e-7)
+
+
+@pytest.mark.parametrize("actions", [1, 3])
+@pytest.mark.parametrize("shift", [0.0, -1.0, 1.0])
+def test_the_gradient_of_the_policy_loss_of_means(actions: int, shift: float) -> None:
+    loss, _, parameters = policy_case(25, 11, actions)
+    within = np.random.default_rng(12).exponential(0.5, 25)
+    alone, gradient_alone = loss(parameters + shift)
+    loss = replace(loss, within=within)
+    value, gradient = loss(parameters + shift)
+    assert value > alone
+    wanted = finite_differences(loss, parameters + shift)
+    np.testing.assert_allclose(gradient, wanted, rtol=1e-5, atol=1e-8)
+    assert np.abs(gradient - gradient_alone).max() > 0.01
+
+
+@pytest.mark.parametrize("actions", [1, 2])
+def test_means_of_equal_states_have_the_expected_density_of_all_of_them(actions: int) -> None:
+    """Each target is the mean of five actions; all five are judged by those of other states."""
+    loss, x, parameters = policy_case(12, 13, actions)
+    rng = np.random.default_rng(14)
+    each = rng.uniform(0.2, 1.0, size=(12, 5))
+    every = rng.normal(0.0, 0.7, size=(12, 5, actions))
+    weights = each.sum(axis=1)
+    means = np.einsum("ij,ijk->ik", each, every) / weights[:, None]
+    squares = np.sum((every - means[:, None]) ** 2, axis=2)
+    within = np.sum(each * squares, axis=1) / weights
+    of_means = PolicyLoss(loss.distances, means, weights, within)
+
+    kernel = Kernel(FACTORS, np.exp(parameters[:-2]))
+    signal, noise = np.exp(parameters[-2:])
+    unit = TaskSpec(3, -np.ones(actions), np.ones(actions))
+    log_densities = np.empty((12, 5))
+    for i in range(12):
+        rest = np.arange(12) != i
+        policy = CostSensitiveGP(
+            unit,
+            kernel,
+            np.repeat(x[rest], 5, axis=0),
+            every[rest].reshape(-1, actions),
+            each[rest].ravel(),
+            signal,
+            noise,
+        )
+        sigma = policy.standard_deviation(x[i : i + 1])
+        z = (every[i] - policy.mean(x[i : i + 1])) / sigma
+        log_densities[i] = np.sum(-0.5 * z**2 - np.log(sigma) - 0.5 * np.log(2.0 * np.pi), axis=1)
+    wanted = -np.average(log_densities, weights=each)
+    assert of_means(parameters)[0] == pytest.approx(wanted, rel=1e-6)
 
 
 def test_factor_distances_stack_the_factors() -> None:

@@ -27,7 +27,7 @@ from kreps.kernels import (
     median_lengthscales,
     squared_distances,
 )
-from kreps.settings import Settings
+from kreps.settings import Settings, settings_of
 
 ALL = tuple(range(PIXELS**2))
 SMOOTHED = SmoothedImage(ALL, (PIXELS, PIXELS))
@@ -293,7 +293,7 @@ def expected(
     data: Transitions, features: FloatArray, model: KernelEmbedding | SampleModel, name: Any
 ) -> FloatArray:
     """As `reps.update` computes it."""
-    origin = reps.embedding_origin(data, features, Settings(model=name))
+    origin = reps.embedding_origin(data, features, settings_of("observed", model=name))
     return origin + model.expected_features(successor_features(data, features) - origin)
 
 

@@ -49,19 +49,26 @@ def test_a_plain_gymnasium_environment_is_learnt_in_unchanged() -> None:
     assert action.shape == (1,) and np.abs(action) <= 2.0
 
 
+def collected(learner: kreps.KREPS, policy: StochasticPolicy, iteration: int) -> list[Rollout]:
+    """What `learn` collects for an update, with `TINY`."""
+    assert learner.env is not None
+    return collect(
+        learner.env,
+        learner.task,
+        policy,
+        3 if iteration else 6,
+        seed=0,
+        iteration=iteration,
+        restart_probability=0.02,
+        held_share=0.0 if iteration else learner.settings.held_share,
+    )
+
+
 def test_counts_are_exact_and_the_window_forgets(learnt: kreps.KREPS) -> None:
     state = learnt.state
     assert (state.iteration, state.rollouts) == (2, 9)
     assert len(state.window.rollouts) == 6
-    first = collect(
-        learnt.env,  # type: ignore[arg-type]
-        learnt.task,
-        BangBang(learnt.task),
-        6,
-        seed=0,
-        iteration=0,
-        restart_probability=0.02,
-    )
+    first = collected(learnt, BangBang(learnt.task), 0)
     latest = sum(len(r) for r in state.window.rollouts[3:])
     assert state.steps == sum(len(r) for r in first) + latest
     for mine, theirs in zip(state.window.rollouts[:3], first[3:], strict=True):
@@ -95,18 +102,8 @@ def test_updates_from_foreign_data_need_no_environment(learnt: kreps.KREPS) -> N
 def test_learn_is_collect_and_update(learnt: kreps.KREPS) -> None:
     by_hand = swing_up()
     policy: StochasticPolicy = BangBang(by_hand.task)
-    for iteration, count in ((0, 6), (1, 3)):
-        assert by_hand.env is not None
-        rollouts = collect(
-            by_hand.env,
-            by_hand.task,
-            policy,
-            count,
-            seed=0,
-            iteration=iteration,
-            restart_probability=0.02,
-        )
-        by_hand.update(rollouts)
+    for iteration in (0, 1):
+        by_hand.update(collected(by_hand, policy, iteration))
         assert by_hand.state.policy is not None
         policy = by_hand.state.policy
     np.testing.assert_allclose(
@@ -209,7 +206,9 @@ def test_callbacks_are_called_in_order_and_told_what_happened() -> None:
         assert report.update.dual.kl <= 1.0 + 1e-3
         assert report.rollout_seconds >= 0
         assert {"basis", "embedding", "dual", "policy"} <= set(report.update.seconds)
-        assert 1.0 <= report.update.effective_samples <= report.update.samples
+        weighted = max(learner.settings.imagined, 1) * report.update.samples
+        assert len(report.update.dual.weights) == weighted
+        assert 1.0 <= report.update.effective_samples <= weighted
 
 
 def test_a_callback_that_returns_false_ends_the_learning_after_all_were_called() -> None:
@@ -304,12 +303,13 @@ def test_stochastic_prediction_has_the_moments_of_the_policy(learnt: kreps.KREPS
 
 def test_stochastic_prediction_draws_anew_each_time(learnt: kreps.KREPS) -> None:
     policy = learnt.policy
-    actions = [float(policy.predict([np.pi, 0.0])[0][0]) for _ in range(10)]
+    # most of them may be clipped
+    actions = [float(policy.predict([np.pi, 0.0])[0][0]) for _ in range(30)]
     assert len(set(actions)) > 3
 
 
 def test_the_predict_of_the_learner_draws_anew_each_time_too(learnt: kreps.KREPS) -> None:
-    actions = [float(learnt.predict([np.pi, 0.0])[0][0]) for _ in range(10)]
+    actions = [float(learnt.predict([np.pi, 0.0])[0][0]) for _ in range(30)]
     assert len(set(actions)) > 3
 
 
@@ -478,15 +478,18 @@ def test_evaluation_agrees_with_the_riccati_equation() -> None:
         assert earned(task, LinearFeedback(factor * gain)) < 1.05 * best
 
 
-def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem() -> None:
+@pytest.mark.parametrize("recipe", ["default", "observed"])
+def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem(recipe: str) -> None:
     # Measured over seeds 0 to 7: cost 1.02 to 1.10 of the optimum for seven, 1.32 for one; the
-    # first policy costs 54 times the optimum, doing nothing 4.6 times.
+    # first policy costs 54 times the optimum, doing nothing 4.6 times.  With the default recipe
+    # 1.02 to 1.06 for six, 1.19 and 1.24.
     _, best = optimum()
     shares = []
     for seed in range(5):
         learner = kreps.KREPS(
             DoubleIntegrator(),
             seed=seed,
+            recipe=recipe,
             restart_probability=P,
             exploration="gaussian",
             initial_rollouts=40,

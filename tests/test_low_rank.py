@@ -72,6 +72,8 @@ def rollouts() -> list[Rollout]:
 def updated(
     given: list[Rollout] | Dataset, compute: Compute | None = None, seed: int = 0, **settings: Any
 ) -> tuple[kreps.KREPS, UpdateInfo]:
+    """One update, of one step unless another recipe is asked for."""
+    settings = {"recipe": "observed", **settings}
     learner = kreps.KREPS(TASK, seed=seed, compute=compute, **settings)
     info = learner.update(given)
     assert isinstance(info, UpdateInfo)

@@ -18,6 +18,7 @@ import pytest
 
 import kreps.evaluation
 from kreps.algorithms import npalp, reps, value_iteration
+from kreps.algorithms.imagined_step import MOST_IMAGINED
 from kreps.experiments.search import CANDIDATES
 from kreps.experiments.specs import FIGURES, METHODS
 from kreps.kernels import IMAGE_BLUR
@@ -107,7 +108,8 @@ def test_there_is_a_page_for_every_compared_method() -> None:
         row = next(row for row in table_rows(index) if f"({page.name})" in row[0])
         method = METHODS[METHOD_OF_PAGE[page.stem]]
         assert f"`{LEARNERS[method.learner].__name__}`" in row[4]
-        assert all(f'`{name}="{value}"`' in row[4] for name, value in method.options.items())
+        named = re.findall(r'`(\w+)="(.+?)"`', row[4])
+        assert dict(named) == dict(method.options)
         assert row[-1].rstrip(" |") == figures
     assert index.index("one_update.md") > index.index("Reading order")
 
@@ -187,12 +189,12 @@ def test_the_commands_are_those_of_the_method(page: Path) -> None:
     assert reproduced == figures_of(method)
     searched = re.findall(r"^kreps search (\S+)$", text, re.MULTILINE)
     assert searched == [task for task, methods in CANDIDATES.items() if method in methods]
-    trained = re.findall(
-        r"^kreps train \S+(?: --set (\w+)=(\w+))? .*--out \S+$", text, re.MULTILINE
-    )
+    trained = re.findall(r"^kreps train \S+ (.*)--out \S+$", text, re.MULTILINE)
     if METHODS[method].learner == "reps":
-        options = dict(METHODS[method].options)
-        assert trained == [next(iter(options.items()), ("", ""))]
+        (asked,) = trained
+        options = dict(re.findall(r"--(recipe) (\S+)", asked))
+        options |= dict(re.findall(r"--set (\w+)=(\w+)", asked))
+        assert options == dict(METHODS[method].options)
     else:
         assert trained == [] and "`kreps train` learns by REPS only" in " ".join(text.split())
 
@@ -217,17 +219,25 @@ def test_the_table_of_parameters_agrees_with_the_settings(page: Path) -> None:
         assert f'`{name}="{value}"`' in text
 
 
-def test_what_the_paper_recipe_changes_is_said() -> None:
-    changed = {f.name for f in fields(Settings) if differ(RECIPES["paper"], Settings(), f.name)}
-    (sentence,) = re.findall(r'^`recipe="paper"` changes (.+?);', KERNEL_PAGE, re.MULTILINE)
+@pytest.mark.parametrize("recipe", [name for name in RECIPES if name != "default"])
+def test_what_a_recipe_changes_is_said(recipe: str) -> None:
+    changed = {f.name for f in fields(Settings) if differ(RECIPES[recipe], Settings(), f.name)}
+    (sentence,) = re.findall(
+        rf'^`recipe="{recipe}"` changes (.+?);', KERNEL_PAGE, re.MULTILINE | re.DOTALL
+    )
     assert set(re.findall(r"`(\w+)`", sentence)) == changed
+
+
+def test_how_the_default_departs_from_the_paper_recipe_is_said() -> None:
+    changed = {f.name for f in fields(Settings) if differ(RECIPES["paper"], Settings(), f.name)}
     deviations = (ROOT / "docs/deviations.md").read_text()
     listed = deviations.split("## What the default recipe changes")[1].split("\n## ")[0]
     items = re.findall(
         r'^\d\. `(\w+) = (\S+)`(?: instead of `?([\w."]+\w"?)`?)?', listed, re.MULTILINE
     )
     assert {name for name, *_ in items} == changed
-    assert f"in {('no', 'one', 'two', 'three', 'four', 'five')[len(changed)]} settings" in listed
+    numbers = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
+    assert f"in {numbers[len(changed)]} settings" in listed
     for name, default, paper in items:
         assert getattr(Settings(), name) == ast.literal_eval(default)
         if paper:
@@ -241,6 +251,11 @@ def test_limits_are_those_of_the_code() -> None:
     assert f"{npalp.MAX_IMPROVEMENTS} is the limit" in (FOLDER / "npalp.md").read_text()
     assert f"more than {MAX_SUPPORT} are refused" in KERNEL_PAGE
     assert f"smoothing of {IMAGE_BLUR:g} of their side" in KERNEL_PAGE
+    assert f"of them but at most {MOST_IMAGINED}" in KERNEL_PAGE
+    (least,) = re.findall(
+        r"^   model's own error, .* and at least `(\S+)`:$", KERNEL_PAGE, re.MULTILINE
+    )
+    assert float(least) == reps.RIDGE_LEAST
 
 
 # ---- metrics, and the example -----------------------------------------------------------------
@@ -284,8 +299,16 @@ def test_the_example_runs_and_reports_what_the_page_explains(
     learner = found["learner"]
     method = METHODS[METHOD_OF_PAGE[page.stem]]
     assert type(learner) is LEARNERS[method.learner]
-    for name, value in method.options.items():
+    options = dict(method.options)
+    recipe = options.pop("recipe", None)
+    for name, value in options.items():
         assert getattr(learner.settings, name) == value
+    if recipe is not None:
+        protocol = {"exploration", "exploration_scale"}
+        changed = {
+            f.name for f in fields(Settings) if differ(learner.settings, RECIPES[recipe], f.name)
+        }
+        assert changed <= options.keys() | tiny.keys() | protocol
     assert np.isfinite([float(word) for word in capsys.readouterr().out.split()]).all()
 
     (report,) = reports

@@ -157,7 +157,7 @@ def test_a_task_without_environment_is_learnt_from_rollouts(method: str) -> None
     rng = np.random.default_rng(0)
     steps = 1 if method == GRID else 8
     rollouts = []
-    for _ in range(60 // steps):
+    for _ in range(120 // steps):
         x = [rng.uniform(-1.5, 1.5, 1)]
         u = rng.normal(0.0, 2.0, (steps, 1))
         for push in u:
@@ -470,7 +470,7 @@ def optimum() -> float:
 # value iteration feel the last bits.
 VARIANTS: list[tuple[str, dict[str, Any], float]] = [
     ("reps", {}, 0.3),
-    ("reps", {"model": "sample"}, 0.3),
+    ("reps", {"recipe": "observed", "model": "sample"}, 0.3),
     ("reps", {"features": "grid", "grid_size": 5}, 0.4),
     ("value-iteration", {}, 0.25),
     ("grid-value-iteration", {}, 0.2),

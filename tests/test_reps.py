@@ -29,6 +29,8 @@ from kreps.kernels import Kernel, factors_of
 from kreps.settings import Settings, settings_of
 
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
+OBSERVED = settings_of("observed")
+"""One step on the actions that were taken: what most of these tests are about."""
 
 
 def collect(
@@ -69,7 +71,7 @@ def run(
         fresh() if state is None else state,
         rollouts,
         task,
-        settings_of() if settings is None else settings,
+        OBSERVED if settings is None else settings,
         np.random.default_rng(seed),
     )
 
@@ -103,7 +105,7 @@ def assert_bounded(info: UpdateInfo, settings: Settings) -> None:
     """KL is at its bound, or below it with the temperature at its floor."""
     dual = info.dual
     assert dual.converged
-    assert dual.weights.shape == (info.samples,)
+    assert dual.weights.shape == (max(settings.imagined, 1) * info.samples,)
     assert dual.weights.sum() == pytest.approx(1.0, abs=1e-12)
     assert (dual.weights >= 0.0).all()
     kl = kl_from_uniform(dual.weights)
@@ -114,21 +116,27 @@ def assert_bounded(info: UpdateInfo, settings: Settings) -> None:
         assert kl == pytest.approx(settings.kl_bound, rel=1.01 * KL_TOLERANCE)
 
 
-@pytest.mark.parametrize("model", ["embedding", "sample"])
-@pytest.mark.parametrize("recipe", ["default", "paper"])
+@pytest.mark.parametrize(
+    ("recipe", "model"),
+    [
+        ("default", "change"),
+        ("default", "embedding"),
+        *[(recipe, model) for recipe in ("observed", "paper") for model in ("embedding", "sample")],
+    ],
+)
 def test_the_weights_move_as_far_as_the_bound_or_the_floor_permits(recipe: str, model: str) -> None:
     settings = settings_of(recipe, model=model)
     _, info = run(collect(), settings)
     assert_bounded(info, settings)
     assert info.samples == 150
     assert info.effective_samples == pytest.approx(1.0 / np.sum(info.dual.weights**2))
-    assert info.effective_samples < 140.0
+    assert info.effective_samples < 140.0 / 150.0 * len(info.dual.weights)
     assert info.rank_residual <= settings.basis_tolerance
     assert (info.embedding_parameters is None) == (model == "sample")
 
 
 def test_fixed_features_are_a_grid_over_all_states() -> None:
-    settings = settings_of(features="grid", grid_size=6)
+    settings = settings_of("observed", features="grid", grid_size=6)
     rollouts = collect()
     state, info = run(rollouts, settings)
     assert_bounded(info, settings)
@@ -141,7 +149,7 @@ def test_fixed_features_are_a_grid_over_all_states() -> None:
 
 
 def test_a_high_floor_keeps_the_update_short_of_the_bound() -> None:
-    settings = settings_of(kl_bound=3.0, eta_floor=2.0)
+    settings = settings_of("observed", kl_bound=3.0, eta_floor=2.0)
     _, info = run(collect(), settings)
     assert info.dual.outcome is Outcome.AT_FLOOR
     assert info.dual.eta == 2.0
@@ -154,7 +162,7 @@ def test_the_weights_are_the_exponentials_of_the_bellman_errors(model: str, feat
     """Eqs. 1, 4 and 5 put together from the learnt V and hyper-parameters, in plain NumPy."""
     restart = 0.07
     rollouts = collect(steps=12) + collect(4, 5, seed=1, terminated=True)
-    settings = settings_of(model=model, features=features, restart_probability=restart)
+    settings = settings_of("observed", model=model, features=features, restart_probability=restart)
     state, info = run(rollouts, settings)
     value = state.value
     assert value is not None
@@ -234,7 +242,7 @@ def test_policy_hyperparameters_are_the_most_probable_ones() -> None:
     rng = np.random.default_rng(13)
     states, targets = rng.normal(size=(25, 2)), rng.normal(0.0, 0.8, size=(25, 1))
     weights = rng.uniform(0.2, 2.0, 25)
-    samples = PolicySamples(states, targets, weights, float(weights.sum()))
+    samples = PolicySamples(states, targets, weights, float(weights.sum()), np.zeros(25))
     kernel = Kernel(factors_of(2), np.array([0.9, 1.4]))
     found = policy_hyperparameters(samples, kernel, settings_of(), None, rng)
 
@@ -261,7 +269,7 @@ def test_bounded_policy_hyperparameters_keep_to_their_ranges() -> None:
     high = np.log([0.9, 1.4, 3.0, 4.0])
     # Pure noise asks for a long lengthscale, targets all zero for no variance.
     for targets in (rng.normal(size=(40, 1)), np.zeros((40, 1)), 100.0 * states[:, :1]):
-        samples = PolicySamples(states, targets, np.ones(40), 40.0)
+        samples = PolicySamples(states, targets, np.ones(40), 40.0, np.zeros(40))
         found = policy_hyperparameters(samples, kernel, settings_of("paper"), None, rng)
         assert (found >= low - 1e-12).all()
         assert (found <= high + 1e-12).all()
@@ -301,7 +309,7 @@ def test_the_old_state_is_not_modified() -> None:
 
 def test_forgotten_rollouts_are_counted_but_not_learnt_from() -> None:
     old, new = collect(6, seed=1), collect(6, 10, seed=2)
-    sample = settings_of(model="sample")
+    sample = settings_of("observed", model="sample")
     first, _ = run(old, sample, fresh(6))
     second, info = run(new, sample, replace(first, policy_start=None))
     alone, _ = run(new, sample, fresh(6))
@@ -332,7 +340,7 @@ def test_rollouts_of_another_width_are_refused(ds: int, da: int) -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1e8])
-@pytest.mark.parametrize("recipe", ["default", "paper"])
+@pytest.mark.parametrize("recipe", ["default", "observed", "paper"])
 def test_the_unit_of_the_reward_changes_nothing_but_the_unit_of_v(
     recipe: str, scale: float
 ) -> None:
@@ -355,7 +363,7 @@ def test_a_constant_added_to_the_reward_changes_nothing() -> None:
     np.testing.assert_allclose(moved.dual.weights, info.dual.weights, atol=1e-8)
 
 
-@pytest.mark.parametrize("recipe", ["default", "paper"])
+@pytest.mark.parametrize("recipe", ["default", "observed", "paper"])
 def test_equal_rewards_are_learnt_from_without_harm(recipe: str) -> None:
     settings = settings_of(recipe)
     state, info = run(with_rewards(collect(), lambda r: np.full_like(r, -3.0)), settings)
@@ -375,7 +383,7 @@ def assert_usable(state: LearnerState, task: TaskSpec = TASK) -> None:
 @pytest.mark.parametrize("model", ["embedding", "sample"])
 def test_duplicated_states_are_served(model: str) -> None:
     rollouts = collect(4, 10)
-    settings = settings_of(model=model)
+    settings = settings_of("observed", model=model)
     state, info = run(rollouts * 3, settings)
     assert_bounded(info, settings)
     assert_usable(state)
@@ -385,19 +393,20 @@ def test_duplicated_states_are_served(model: str) -> None:
     np.testing.assert_allclose(weights[1:], weights[:1].repeat(2, axis=0), atol=1e-9)
 
 
-def test_a_single_distinct_state_is_served() -> None:
+@pytest.mark.parametrize("recipe", ["default", "observed"])
+def test_a_single_distinct_state_is_served(recipe: str) -> None:
     rng = np.random.default_rng(6)
     still = [
         Rollout(np.full((6, 2), 0.3), rng.normal(size=(5, 1)), rng.normal(size=5)) for _ in range(4)
     ]
-    settings = settings_of()
+    settings = settings_of(recipe)
     state, info = run(still, settings)
     assert info.rank == 1
     assert_bounded(info, settings)
     assert_usable(state)
 
 
-@pytest.mark.parametrize("recipe", ["default", "paper"])
+@pytest.mark.parametrize("recipe", ["default", "observed", "paper"])
 def test_a_single_distinct_action_is_served(recipe: str) -> None:
     same = [replace(r, actions=np.full_like(r.actions, 0.5)) for r in collect()]
     settings = settings_of(recipe)
@@ -405,30 +414,39 @@ def test_a_single_distinct_action_is_served(recipe: str) -> None:
     assert_bounded(info, settings)
     assert_usable(state)
     assert state.policy is not None
-    near = np.concatenate([r.observations[:-1] for r in same])[info.dual.weights > 0.01]
+    if settings.imagined:
+        weights = state.policy.weights / state.policy.weights.sum()
+        near = state.policy.states[weights > 0.01]
+    else:
+        near = np.concatenate([r.observations[:-1] for r in same])[info.dual.weights > 0.01]
     np.testing.assert_allclose(state.policy.mean(near), 0.5, atol=0.1)
 
 
-@pytest.mark.parametrize("recipe", ["default", "paper"])
+@pytest.mark.parametrize("recipe", ["default", "observed", "paper"])
 def test_a_single_step_is_served(recipe: str) -> None:
     one = [Rollout(np.array([[0.0, 0.0], [0.1, 0.3]]), np.array([[1.0]]), np.array([-1.0]))]
     settings = settings_of(recipe)
     state, info = run(one, settings)
-    np.testing.assert_array_equal(info.dual.weights, [1.0])
+    if settings.imagined:  # all that is expected of an action is that of the only one
+        np.testing.assert_allclose(info.dual.weights, np.full(settings.imagined, 0.25), atol=0.01)
+    else:
+        np.testing.assert_array_equal(info.dual.weights, [1.0])
     assert info.dual.outcome is Outcome.AT_FLOOR
     assert info.support == 1
     assert_usable(state)
 
 
-def test_rewards_with_one_enormous_outlier_are_served() -> None:
+@pytest.mark.parametrize("recipe", ["default", "observed"])
+def test_rewards_with_one_enormous_outlier_are_served(recipe: str) -> None:
     rollouts = collect()
     spoilt = np.array(rollouts[0].rewards)
     spoilt[3] = -1e9
     rollouts[0] = replace(rollouts[0], rewards=spoilt)
-    settings = settings_of()
+    settings = settings_of(recipe)
     state, info = run(rollouts, settings)
     assert_bounded(info, settings)
-    assert info.dual.weights[3] < 1e-6
+    if not settings.imagined:
+        assert info.dual.weights[3] < 1e-6
     assert_usable(state)
 
 
@@ -443,14 +461,15 @@ def test_a_periodic_coordinate_is_learnt_as_one() -> None:
     np.testing.assert_allclose(state.value(turned), state.value(query), atol=1e-6)
 
 
-def test_several_actions_of_unequal_scale_are_served() -> None:
+@pytest.mark.parametrize("recipe", ["default", "observed"])
+def test_several_actions_of_unequal_scale_are_served(recipe: str) -> None:
     rng = np.random.default_rng(10)
     task = TaskSpec(2, np.array([-2.0, 0.0]), np.array([2.0, 1000.0]))
     rollouts = [
         replace(r, actions=np.column_stack([r.actions, rng.uniform(0, 1000, len(r))]))
         for r in collect()
     ]
-    settings = settings_of()
+    settings = settings_of(recipe)
     state, info = run(rollouts, settings, task=task)
     assert_bounded(info, settings)
     assert state.policy is not None

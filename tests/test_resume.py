@@ -82,7 +82,13 @@ def ten_in_one_go(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    "settings", [{}, {"model": "sample"}, {"features": "grid"}, {"policy_fit": "bounded"}]
+    "settings",
+    [
+        {},
+        {"recipe": "observed", "model": "sample"},
+        {"features": "grid"},
+        {"policy_fit": "bounded"},
+    ],
 )
 def test_two_and_two_iterations_are_four(settings: dict[str, Any], tmp_path: Path) -> None:
     def learner() -> kreps.KREPS:

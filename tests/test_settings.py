@@ -14,11 +14,41 @@ def test_the_default_recipe_is_the_defaults() -> None:
     assert settings_of() == settings_of("default") == Settings()
 
 
+def test_the_observed_recipe_is_one_step_with_the_numbers_of_old() -> None:
+    observed = settings_of("observed")
+    assert (observed.kl_bound, observed.eta_floor, observed.ridge) == (1.0, 0.1, 0.1)
+    assert (observed.imagined, observed.held_share) == (0, 0.0)
+    assert (observed.model, observed.features, observed.policy_fit) == ("change", "rkhs", "map")
+
+
+def test_the_default_recipe_asks_the_model_for_more_than_the_observed_one() -> None:
+    default = settings_of()
+    assert default.ridge is None
+    assert default.imagined > 0
+    own = {"ridge": 0.1, "imagined": 0, "eta_floor": 0.1, "held_share": 0.0}
+    assert settings_of("default", **own) == settings_of("observed")
+
+
+@pytest.mark.parametrize("changes", [{}, {"imagined": 0}, {"ridge": 0.1}])
+def test_without_a_model_nothing_can_be_imagined(changes: dict[str, Any]) -> None:
+    with pytest.raises(ConfigurationError, match=r'recipe="observed".*imagined=0.*ridge=0.1'):
+        settings_of("default", model="sample", **changes)
+    without = settings_of("default", model="sample", imagined=0, ridge=0.1)
+    assert (without.model, without.imagined, without.ridge) == ("sample", 0, 0.1)
+    for recipe in ("observed", "paper"):
+        assert settings_of(recipe, model="sample").model == "sample"
+        with pytest.raises(ConfigurationError, match="imagined = 2"):
+            settings_of(recipe, model="sample", imagined=2)
+        with pytest.raises(ConfigurationError, match="ridge = None"):
+            settings_of(recipe, model="sample", ridge=None)
+
+
 def test_the_paper_recipe_has_a_low_floor_and_hard_ranges() -> None:
     paper = settings_of("paper")
     assert (paper.eta_floor, paper.policy_fit) == (0.02, "bounded")
     assert 0.0 < paper.kl_bound < 1.0  # the paper leaves it open
     assert paper.model == "embedding"
+    assert (paper.ridge, paper.imagined, paper.held_share) == (0.1, 0, 0.0)
     assert (paper.initial_rollouts, paper.rollouts_per_iteration, paper.window) == (30, 10, 30)
     assert paper.restart_probability == 0.02
 
@@ -31,7 +61,7 @@ def test_a_change_overrides_the_recipe_and_nothing_else() -> None:
 
 
 def test_an_unknown_recipe_is_refused_with_the_choices() -> None:
-    with pytest.raises(ConfigurationError, match=r"'papre'.*'default', 'paper'"):
+    with pytest.raises(ConfigurationError, match=r"'papre'.*'default', 'observed', 'paper'"):
         settings_of("papre")
 
 
@@ -49,9 +79,12 @@ def test_an_unknown_parameter_is_refused_with_the_choices() -> None:
         ("exploration", None),
         *[
             (name, value)
-            for name in ("kl_bound", "ridge", "exploration_scale", "basis_tolerance")
+            for name in ("kl_bound", "exploration_scale", "basis_tolerance")
             for value in (0.0, -1.0, float("inf"), float("nan"), "1", True, None)
         ],
+        *[("ridge", value) for value in (0.0, -1.0, float("inf"), float("nan"), "1", True)],
+        *[("imagined", value) for value in (-1, 2.5, 4.0, "4", True, None)],
+        *[("held_share", value) for value in (-0.1, 1.1, float("nan"), "0.5", False, None)],
         *[("eta_floor", value) for value in (-1e-9, float("inf"), float("nan"), "0", False)],
         *[("restart_probability", value) for value in (0.0, 1.0, -0.1, 1.5, float("nan"), "0.1")],
         *[
@@ -80,7 +113,13 @@ def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
         ("kl_bound", 2),
         ("restart_probability", 0.999),
         ("window", 1),
-        ("model", "sample"),
+        ("ridge", None),
+        ("ridge", 1e-9),
+        ("imagined", 0),
+        ("imagined", 1),
+        ("held_share", 0),
+        ("held_share", 1),
+        ("model", "embedding"),
         ("features", "grid"),
         ("policy_fit", "bounded"),
         ("exploration", "gaussian"),

@@ -283,7 +283,9 @@ def test_a_window_without_end_survives_a_checkpoint(tmp_path: Path) -> None:
     assert kreps.KREPS.resume(tmp_path / "x").settings.window is None
 
 
-@pytest.mark.parametrize("settings", [{"model": "sample"}, {"features": "grid"}])
+@pytest.mark.parametrize(
+    "settings", [{"recipe": "observed", "model": "sample"}, {"features": "grid"}]
+)
 def test_checkpoints_of_the_other_variants_come_back_exactly(
     settings: dict[str, Any], tmp_path: Path
 ) -> None:

@@ -89,7 +89,8 @@ def train(
     iterations: Annotated[int, typer.Option(min=1, help="Policy updates to make.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same policy.")] = 0,
     recipe: Annotated[
-        str, typer.Option(help="default; paper: close to the printed method; images: for pictures.")
+        str,
+        typer.Option(help="default; observed: one step on the actions taken; paper: as printed."),
     ] = "default",
     set_: Annotated[
         list[str],

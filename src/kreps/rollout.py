@@ -150,7 +150,7 @@ def collect(
     seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
     noises: list[Noise] = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
     for j in range(count):
-        if int((j + 1) * held_share) > int(j * held_share):
+        if round((j + 1) * held_share, 9) // 1 > round(j * held_share, 9) // 1:
             rng = generator(seed, Purpose.POLICY, iteration, j)
             noises[j] = HeldNoise(rng, restart_probability**-0.5)
     lengths = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]

@@ -88,9 +88,11 @@ def update(
     Raises:
         DataError: no roll-outs at all, or some of another width than the task's.
     """
+    newest: Sequence[Rollout] = ()
     if isinstance(rollouts, Dataset):
         window, dataset, seen = state.window, rollouts, None
     else:
+        newest = rollouts
         seen = len(rollouts), sum(len(rollout) for rollout in rollouts)
         window = state.extended_window(rollouts, task)
         dataset = Dataset.of(window.rollouts)
@@ -208,7 +210,9 @@ def update(
         eta_floor=problem.eta_floor,
         ridge=ridge,
         model_error=float("nan") if errors is None else errors.relative,
-        clipped=share_clipped(sample.actions, task),
+        clipped=share_clipped(
+            np.concatenate([r.actions for r in newest]) if newest else sample.actions, task
+        ),
         rank=problem.rank,
         rank_residual=basis.residual,
         dual=dual,

@@ -12,7 +12,7 @@ REFERENCE_REWARDS: dict[str, dict[str, float]] = {
         "uniformly random torque": -101.0,
     },
     "kreps/Reaching-v0": {
-        "best known (direct optimal control)": -0.064,
+        "best known (direct optimal control)": -0.061,
         "random torques (0.5 N m)": -0.8,
     },
 }

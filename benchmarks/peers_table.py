@@ -1,0 +1,92 @@
+"""kreps beside its peers at equal environment steps: writes ``results/peers.md``.
+
+    python benchmarks/peers_table.py
+
+It reads ``results/peers.json`` (Stable-Baselines3, by ``benchmarks/peers.py``), ``untuned.csv``
+(``kreps reproduce untuned``) and ``figure-1b.csv`` (REPS on fixed features, ``kreps reproduce
+figure-1b``).  Every entry is of the policy learnt from at most so many steps.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kreps.experiments.figures import at_most, read_off
+from kreps.experiments.specs import FEATURES
+from kreps.experiments.tables import markdown
+
+RESULTS = Path(__file__).resolve().parents[1] / "results"
+MARKS = (3000, 5000, 8000)
+TASKS = {
+    "swing-up": "swing-up, long",
+    "reaching": "reaching, own start",
+    "images": "images, long",
+    "pendulum": "pendulum",
+    "mountain-car": "mountain-car",
+}
+"""Tasks of the peers and what the experiment of kreps calls them."""
+
+Curve = list[dict[str, Any]]
+
+
+def cpu_seconds(curve: Sequence[dict[str, Any]]) -> float:
+    """To learn from the last mark's steps, roll-outs and updates, evaluation not counted."""
+    last = float(at_most(curve, MARKS[-1])["steps"])
+    counted = [row for row in curve if float(row["steps"]) <= last]
+    return sum(float(r["rollout_cpu_seconds"]) + float(r["update_cpu_seconds"]) for r in counted)
+
+
+def of_kreps(file: str, task: str, method: str | None) -> list[Curve]:
+    """The curves of a task (and method), one a seed."""
+    with open(RESULTS / file, newline="") as opened:
+        rows = [row for row in csv.DictReader(opened) if row["task"] == task]
+    rows = [row for row in rows if method in (None, row["method"])]
+    return [[r for r in rows if r["seed"] == seed] for seed in sorted({r["seed"] for r in rows})]
+
+
+def of_peers(task: str, learner: str) -> list[Curve]:
+    """The same of a peer: a row a mark."""
+    rows = json.loads((RESULTS / "peers.json").read_text())["rows"]
+    mine = [{**r, "steps": r["mark"]} for r in rows if (r["task"], r["learner"]) == (task, learner)]
+    return [[r for r in mine if r["seed"] == seed] for seed in sorted({r["seed"] for r in mine})]
+
+
+def line(task: str, name: str, curves: list[Curve], seconds: Sequence[float], least: float) -> Any:
+    read = [
+        f"{read_off(curves, 'stochastic', mark)} / {read_off(curves, 'greedy', mark)}"
+        for mark in MARKS
+    ]
+    cost = float(np.mean(seconds))
+    return [task, name, str(len(curves)), *read, f"{cost:.0f}", f"{cost / least:.1f}"]
+
+
+def table() -> str:
+    """As Markdown."""
+    lines = []
+    for task, ours in TASKS.items():
+        curves = of_kreps("untuned.csv", ours, None)
+        mine = [cpu_seconds(curve) for curve in curves]
+        least = float(np.mean(mine))
+        lines.append(line(task, "kreps, untuned", curves, mine, least))
+        if task == "swing-up":
+            features = of_kreps("figure-1b.csv", task, FEATURES)
+            seconds = [cpu_seconds(curve) for curve in features]
+            lines.append(line(task, f"{FEATURES} (seeds 0 to 9)", features, seconds, least))
+        for learner in ("sac", "ppo"):
+            if curves := of_peers(task, learner):
+                seconds = [at_most(curve, MARKS[-1])["cpu_seconds"] for curve in curves]
+                lines.append(line(task, learner.upper(), curves, seconds, least))
+    marks = [f"{mark} steps" for mark in MARKS]
+    return markdown(["task", "learner", "seeds", *marks, "CPU s", "times ours"], lines)
+
+
+if __name__ == "__main__":
+    made = table()
+    (RESULTS / "peers.md").write_text(made + "\n")
+    print(made)

@@ -1,0 +1,532 @@
+"""The second step: what is drawn, what the model says of it, and what the policy makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kreps
+from kreps.algorithms import imagined_step, low_rank_reps, reps, transition_model
+from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine, resample
+from kreps.algorithms.reps import (
+    DROPPED_WEIGHT,
+    RIDGE_LEAST,
+    PolicySamples,
+    UpdateInfo,
+    feature_differences,
+    new_actions,
+    share_clipped,
+    stationarity_ridge,
+    successor_features,
+    value_basis,
+)
+from kreps.algorithms.transition_model import fit_embedding, state_actions, state_kernel
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec, Transitions
+from kreps.dataset import Dataset
+from kreps.dual import ETA_LEAST, DualProblem, effective_sample_size, standardise
+from kreps.embedding import KernelEmbedding, LeaveOneOut
+from kreps.hyperparameters import Prior, minimise
+from kreps.kernels import Kernel, SquaredExponential
+from kreps.policies import StochasticPolicy
+from kreps.settings import Settings, settings_of
+
+TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
+
+
+def pushes(rollouts: int = 8, steps: int = 15, seed: int = 0, ended: bool = False) -> list[Rollout]:
+    """A mass with friction on a line, pushed at random, often beyond the limits."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for number in range(rollouts):
+        states = [np.array([rng.normal(), 0.0])]
+        actions = rng.normal(0.0, 2.0, size=(steps, 1))
+        for force in TASK.clip(actions)[:, 0]:
+            velocity = 0.9 * states[-1][1] + 0.3 * force + 0.05 * rng.normal()
+            states.append(np.array([states[-1][0] + 0.3 * velocity, velocity]))
+        observations = np.array(states)
+        rewards = -(observations[:-1, 0] ** 2) - 0.1 * observations[:-1, 1] ** 2
+        rewards -= 0.01 * TASK.clip(actions)[:, 0] ** 2
+        found.append(Rollout(observations, actions, rewards, ended and number % 2 == 0))
+    return found
+
+
+def updated(
+    given: list[Rollout] | Dataset, seed: int = 0, **settings: Any
+) -> tuple[kreps.KREPS, UpdateInfo]:
+    learner = kreps.KREPS(TASK, seed=seed, **settings)
+    info = learner.update(given)
+    assert isinstance(info, UpdateInfo)
+    return learner, info
+
+
+# ---- which states -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("count", [1, 7, 40, 1000])
+@pytest.mark.parametrize("seed", range(5))
+def test_states_are_drawn_as_often_as_their_weights_say(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    p = np.exp(3.0 * rng.normal(size=30))
+    p[rng.uniform(size=30) < 0.3] = 0.0
+    p /= p.sum()
+    rows = resample(p, count, rng)
+    assert len(rows) == count
+    assert (np.diff(rows) >= 0).all()
+    counts = np.bincount(rows, minlength=30)
+    assert (counts >= np.floor(count * p - 1e-9)).all()
+    assert (counts <= np.ceil(count * p + 1e-9)).all()
+    assert not counts[p == 0.0].any()
+
+
+def test_the_draw_of_states_is_unbiased() -> None:
+    rng = np.random.default_rng(0)
+    p = np.array([0.5, 0.03, 0.17, 0.3])
+    counts = sum(np.bincount(resample(p, 7, rng), minlength=4) for _ in range(4000))
+    # each count is one of two neighbours: a standard deviation of at most one half
+    np.testing.assert_allclose(counts / 4000.0, 7.0 * p, atol=5 * 0.5 / np.sqrt(4000.0))
+
+
+def test_weights_need_not_add_up_to_one() -> None:
+    p = np.array([0.1, 0.2, 0.3])
+    one, other = (resample(scale * p, 60, np.random.default_rng(1)) for scale in (1.0, 1e-3))
+    np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(np.bincount(one), [10, 20, 30])
+
+
+# ---- what the model says of them --------------------------------------------------------------
+
+
+@dataclass
+class Given:
+    """A policy whose actions are given, whatever the states; it keeps what it was asked."""
+
+    actions: FloatArray
+    states: FloatArray | None = None
+
+    def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
+        assert noise.shape == self.actions.shape
+        self.states = states
+        return self.actions
+
+
+@dataclass(frozen=True)
+class Case:
+    """Everything that the first step has before it solves its dual."""
+
+    data: Transitions
+    settings: Settings
+    features: FloatArray
+    origin: FloatArray
+    successors: FloatArray
+    rewards: FloatArray
+    model: KernelEmbedding
+
+    @classmethod
+    def of(cls, **changes: Any) -> Case:
+        rng = np.random.default_rng(5)
+        settings = settings_of("default", **changes)
+        data = Transitions.of(pushes(ended=True))
+        kernel = state_kernel(data, TASK, rng)
+        _, features = value_basis(data, kernel, settings)
+        origin = reps.embedding_origin(data, features, settings)
+        successors = successor_features(data, features) - origin
+        model, _ = fit_embedding(data, successors, kernel, TASK, None, rng)
+        rewards, _ = standardise(data.rewards)
+        return cls(data, settings, features, origin, successors, rewards, model)
+
+    def outlook(self, predict: Callable[[FloatArray], FloatArray] | None = None) -> Outlook:
+        says = self.model.predictor(Outlook.targets(self.successors, self.rewards))
+        return Outlook(
+            states=self.data.states,
+            features=self.features[self.data.state],
+            origin=self.origin,
+            start=self.features[self.data.start].mean(axis=0),
+            rewards=self.rewards,
+            predict=says if predict is None else predict,
+        )
+
+    def imagined(
+        self, policy: StochasticPolicy, weights: FloatArray | None = None, **changes: Any
+    ) -> ImaginedSamples:
+        """With uniform weights, if none are given, and a ridge of 0.3."""
+        n = len(self.data)
+        return imagine(
+            self.outlook(changes.pop("predict", None)),
+            np.full(n, 1.0 / n) if weights is None else weights,
+            policy,
+            TASK,
+            replace(self.settings, **changes),
+            0.3,
+            np.random.default_rng(6),
+        )
+
+
+@pytest.mark.parametrize("model", ["change", "embedding"])
+def test_of_the_observed_actions_the_model_says_what_the_first_step_was_told(model: Any) -> None:
+    case = Case.of(model=model)
+    data = case.data
+    found = case.imagined(Given(data.actions), imagined=1)
+    np.testing.assert_array_equal(found.rows, np.arange(len(data)))
+    np.testing.assert_array_equal(found.actions, data.actions)
+    expected = case.origin + case.model.expected_features(case.successors)
+    p = case.settings.restart_probability
+    wanted = feature_differences(data, case.features, expected, p)
+    assert np.abs(wanted).max() > 0.1
+    np.testing.assert_allclose(found.problem.differences, wanted, atol=1e-8)
+    mean = case.rewards.mean()
+    said = mean + case.model.expected_features(case.rewards - mean)
+    said = np.clip(said, case.rewards.min(), case.rewards.max())
+    np.testing.assert_allclose(found.problem.rewards, said - said.max(), atol=1e-8)
+    assert np.corrcoef(said, case.rewards)[0, 1] > 0.9
+
+
+def test_the_bounds_are_those_of_the_settings() -> None:
+    case = Case.of(kl_bound=0.4, eta_floor=0.07)
+    n = len(case.data)
+    policy = Given(np.zeros((3 * n, 1)))
+    problem = case.imagined(policy, imagined=3).problem
+    assert (problem.kl_bound, problem.eta_floor) == (0.4, 0.07)
+    assert problem.ridge == pytest.approx(0.3 / (3 * n), rel=1e-12)
+    assert case.imagined(policy, imagined=3, eta_floor=0.0).problem.eta_floor == ETA_LEAST
+
+
+def test_actions_are_drawn_in_the_states_of_the_weights() -> None:
+    case = Case.of(imagined=2)
+    n = len(case.data)
+    weights = np.zeros(n)
+    weights[[3, 11]] = 0.25, 0.75
+    policy = Given(np.zeros((2 * n, 1)))
+    found = case.imagined(policy, weights)
+    np.testing.assert_array_equal(np.bincount(found.rows)[[3, 11]], [n // 2, 3 * n // 2])
+    assert policy.states is not None
+    np.testing.assert_array_equal(policy.states, case.data.states[found.rows])
+
+
+def test_the_model_is_asked_about_the_applied_actions_and_the_commanded_ones_are_kept() -> None:
+    case = Case.of(imagined=1)
+    n = len(case.data)
+    commanded = np.linspace(-5.0, 5.0, n)[:, None]
+    asked: list[FloatArray] = []
+
+    def predict(inputs: FloatArray) -> FloatArray:
+        asked.append(inputs)
+        return np.zeros((len(inputs), case.features.shape[1] + 1))
+
+    found = case.imagined(Given(commanded), predict=predict)
+    np.testing.assert_array_equal(found.actions, commanded)
+    (inputs,) = asked
+    np.testing.assert_array_equal(inputs[:, :2], case.data.states)
+    np.testing.assert_allclose(inputs[:, 2], np.clip(commanded[:, 0], -2.0, 2.0) / 2.0)
+
+
+def test_no_reward_beyond_the_observed_ones_is_believed() -> None:
+    case = Case.of(imagined=1)
+    n, r = len(case.data), case.features.shape[1]
+    overshooting = np.linspace(-100.0, 100.0, n)
+
+    def predict(inputs: FloatArray) -> FloatArray:
+        return np.column_stack([np.zeros((len(inputs), r)), overshooting])
+
+    rewards = case.imagined(Given(np.zeros((n, 1))), predict=predict).problem.rewards
+    assert rewards.max() == 0.0
+    assert rewards.min() == pytest.approx(-np.ptp(case.rewards))
+    wanted = np.clip(case.rewards.mean() + overshooting, case.rewards.min(), case.rewards.max())
+    np.testing.assert_allclose(rewards, wanted - wanted.max(), atol=1e-12)
+
+
+@pytest.mark.parametrize("spread", [0.5, 3.0, 50.0])
+def test_predicted_rewards_stay_within_the_observed_range(spread: float) -> None:
+    case = Case.of(imagined=5)
+    actions = spread * np.random.default_rng(7).normal(size=(5 * len(case.data), 1))
+    rewards = case.imagined(Given(actions)).problem.rewards
+    assert rewards.max() == 0.0
+    assert rewards.min() >= -np.ptp(case.rewards) - 1e-12
+
+
+def test_no_more_is_imagined_than_fits_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(imagined_step, "MOST_IMAGINED", 37)
+    case = Case.of(imagined=4)
+    found = case.imagined(Given(np.zeros((37, 1))))
+    assert len(found.rows) == len(found.actions) == len(found.problem.rewards) == 37
+    assert found.problem.differences.shape == (37, case.features.shape[1])
+    assert found.problem.ridge == pytest.approx(0.3 / 37)
+    _, info = updated(pushes())
+    assert (info.samples, len(info.dual.weights)) == (120, 37)
+
+
+# ---- the ridge that the model asks for --------------------------------------------------------
+
+
+def errors_of_refits(model: KernelEmbedding, targets: FloatArray) -> FloatArray:
+    """Each target less what a model of all other samples says of it."""
+    errors = []
+    for i in range(len(targets)):
+        rest = np.arange(len(targets)) != i
+        refit = KernelEmbedding.fit(model.kernel, model.inputs[rest], model.regulariser)
+        errors.append(targets[i] - refit.strengths(model.inputs[i : i + 1])[:, 0] @ targets[rest])
+    return np.array(errors)
+
+
+def test_the_ridge_is_the_error_of_refits_without_each_sample() -> None:
+    rollouts = pushes(6, 12)
+    _, info = updated(rollouts)
+    data = Transitions.of(rollouts)
+    settings = settings_of()
+    # the same factors, with the lengthscales that the update reports
+    kernel = state_kernel(data, TASK, np.random.default_rng(0))
+    kernel = kernel.with_lengthscales(info.state_lengthscales)
+    _, features = value_basis(data, kernel, settings)
+    targets = features[data.successor] - features[data.state]
+    assert info.embedding_parameters is not None
+    *lengthscales, regulariser = info.embedding_parameters
+    factors = (*kernel.factors, SquaredExponential((2,)))
+    model = KernelEmbedding.fit(
+        Kernel(factors, np.array(lengthscales)), state_actions(data, TASK), regulariser
+    )
+    errors = errors_of_refits(model, targets)
+    assert info.ridge == pytest.approx(np.mean(np.sum(errors**2, axis=1)), rel=1e-6)
+    assert info.ridge > 10.0 * RIDGE_LEAST
+    share = np.sqrt(np.sum(errors**2) / np.sum(targets**2))
+    assert info.model_error == pytest.approx(share, rel=1e-6)
+
+
+def test_a_ridge_that_is_given_is_taken() -> None:
+    for ridge in (0.01, 3.0):
+        _, info = updated(pushes(4), ridge=ridge)
+        assert info.ridge == ridge
+    rng = np.random.default_rng(8)
+    errors = LeaveOneOut(rng.normal(size=(9, 3)), rng.normal(size=(9, 3)))
+    assert stationarity_ridge(settings_of(), errors) == pytest.approx(errors.mean_square)
+    assert stationarity_ridge(settings_of("observed"), None) == 0.1
+
+
+def test_a_model_without_error_leaves_some_ridge() -> None:
+    errors = LeaveOneOut(np.ones((4, 2)), np.zeros((4, 2)))
+    assert stationarity_ridge(settings_of(), errors) == RIDGE_LEAST
+    still = [replace(r, observations=np.full_like(r.observations, 0.3)) for r in pushes(3)]
+    learner, info = updated(still)
+    assert info.ridge == RIDGE_LEAST
+    assert info.model_error == 0.0  # nothing was to be predicted
+    assert np.isfinite(learner.policy.predict([0.3, 0.3], deterministic=True)[0]).all()
+
+
+def test_without_a_model_there_is_neither_error_nor_second_step() -> None:
+    for approximation in ("exact", "pivoted"):
+        _, info = updated(pushes(4), recipe="observed", model="sample", approximation=approximation)
+        assert np.isnan(info.model_error)
+        assert info.ridge == 0.1
+        assert len(info.dual.weights) == info.samples
+        assert "imagined step" not in info.seconds
+
+
+# ---- what the policy is fitted to -------------------------------------------------------------
+
+
+def test_targets_are_the_weighted_means_of_the_actions_of_each_state() -> None:
+    data = Transitions.of(pushes(3, 8))
+    task = TaskSpec(2, np.array([-2.0, 0.0]), np.array([2.0, 10.0]))
+    rng = np.random.default_rng(9)
+    rows = np.sort(rng.choice(len(data), 60))
+    actions = rng.normal([0.0, 5.0], [2.0, 3.0], size=(60, 2))
+    p = np.exp(rng.normal(size=60))
+    p[rows == rows[30]] = 1e-9  # one state of no weight at all, and a sample here and there
+    p[::7] = 1e-9
+    p /= p.sum()
+    nothing = DualProblem(np.zeros(60), np.zeros((60, 1)), 1.0, 1.0, 1.0)
+    found = PolicySamples.imagined(data, ImaginedSamples(rows, actions, nothing), p, task)
+
+    scaled = (actions - [0.0, 5.0]) / [2.0, 5.0]
+    w = p * effective_sample_size(p)
+    kept = 60 * p >= DROPPED_WEIGHT
+    states = [i for i in np.unique(rows) if kept[rows == i].any()]
+    assert rows[30] not in states and 10 < len(states) < len(np.unique(rows))
+    np.testing.assert_array_equal(found.states, data.states[states])
+    for place, i in enumerate(states):
+        mine = kept & (rows == i)
+        mean = np.average(scaled[mine], axis=0, weights=w[mine])
+        spread = np.average((scaled[mine] - mean) ** 2, axis=0, weights=w[mine])
+        assert found.weights[place] == pytest.approx(w[mine].sum())
+        np.testing.assert_allclose(found.targets[place], mean, atol=1e-12)
+        assert found.within[place] == pytest.approx(spread.sum(), abs=1e-12)
+    assert found.evidence == pytest.approx(w[kept].sum())
+
+
+def test_of_one_action_in_each_state_nothing_is_lost() -> None:
+    data = Transitions.of(pushes(3, 8))
+    p = np.random.default_rng(10).uniform(0.01, 2.0, len(data))
+    p /= p.sum()
+    n = len(data)
+    nothing = DualProblem(np.zeros(n), np.zeros((n, 1)), 1.0, 1.0, 1.0)
+    wanted = PolicySamples.of(data, p, TASK)
+    found = PolicySamples.imagined(
+        data, ImaginedSamples(np.arange(n), data.actions, nothing), p, TASK
+    )
+    for name, value in vars(wanted).items():
+        np.testing.assert_allclose(getattr(found, name), value, atol=1e-14)
+
+
+def test_the_spread_of_what_is_imagined_in_a_state_stays_in_the_policy() -> None:
+    """Equal actions on average, but some agree and some do not: the noise tells them apart."""
+    rng = np.random.default_rng(11)
+    states, means = rng.normal(size=(40, 2)), 0.1 * rng.normal(size=(40, 1))
+    kernel = Kernel(TASK.state_factors, np.ones(2))
+    noise = []
+    for within in (0.0, 0.5):
+        samples = PolicySamples(states, means, np.full(40, 4.0), 160.0, np.full(40, within))
+        x = reps.policy_hyperparameters(samples, kernel, settings_of(), None, rng)
+        noise.append(float(np.exp(x[-1])))
+    assert noise[1] == pytest.approx(0.5, rel=0.2)
+    assert noise[0] < 0.1
+
+
+# ---- the update -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+def test_one_seed_gives_one_learner_to_the_last_byte(approximation: str, tmp_path: Path) -> None:
+    contents, actions = [], []
+    for seed in (7, 7, 8):
+        learner, info = updated(pushes(), seed, approximation=approximation)
+        assert "imagined step" in info.seconds
+        learner.save(tmp_path / "learner")
+        contents.append((tmp_path / "learner").read_bytes())
+        actions.append(learner.policy.process.greedy(np.eye(2)))
+    assert contents[0] == contents[1]
+    np.testing.assert_array_equal(actions[0], actions[1])
+    assert np.abs(actions[2] - actions[0]).min() > 1e-6  # other actions were drawn
+
+
+@pytest.mark.parametrize("model", ["change", "embedding"])
+def test_in_low_rank_it_comes_near_the_exact_update(model: str) -> None:
+    full: dict[str, Any] = {"basis_tolerance": 1e-9, "max_rank": 5000, "rank": 5000}
+    rollouts = pushes(ended=True)
+    exact, wanted = updated(rollouts, approximation="exact", model=model, **full)
+    found, info = updated(rollouts, approximation="pivoted", model=model, **full)
+    assert info.rank == wanted.rank
+    assert info.ridge == pytest.approx(wanted.ridge, rel=1e-5)
+    assert info.model_error == pytest.approx(wanted.model_error, rel=1e-5)
+    assert len(info.dual.weights) == len(wanted.dual.weights) == 4 * 120
+    assert np.abs(info.dual.weights - wanted.dual.weights).sum() < 1e-4
+    states = np.concatenate([r.observations for r in rollouts])
+    for name in ("greedy", "standard_deviation"):
+        mine, theirs = (getattr(each.policy.process, name)(states) for each in (found, exact))
+        np.testing.assert_allclose(mine, theirs, atol=1e-3)
+
+
+def test_a_set_of_samples_is_learnt_from_in_one_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    def never(*arguments: Any) -> None:
+        raise AssertionError("nothing is imagined of a set")
+
+    monkeypatch.setattr(low_rank_reps, "imagine", never)
+    _, info = updated(Dataset.of(pushes()))
+    assert len(info.dual.weights) == info.samples == 120
+    with pytest.raises(AssertionError, match="imagined"):
+        updated(pushes(), approximation="pivoted")
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+def test_the_second_step_begins_where_the_first_one_ended(
+    approximation: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module: Any = reps if approximation == "exact" else low_rank_reps
+    solved: list[tuple[Any, Any, Any]] = []
+    drawn: list[tuple[FloatArray, StochasticPolicy]] = []
+    solve, draw = module.solve_dual, module.imagine
+
+    def spy(problem: Any, start: Any = None) -> Any:
+        solved.append((problem, start, solve(problem, start=start)))
+        return solved[-1][2]
+
+    def watch(outlook: Outlook, weights: FloatArray, policy: Any, *others: Any) -> Any:
+        drawn.append((weights, policy))
+        return draw(outlook, weights, policy, *others)
+
+    monkeypatch.setattr(module, "solve_dual", spy)
+    monkeypatch.setattr(module, "imagine", watch)
+    learner, info = updated(pushes(), approximation=approximation)
+    (first, _, one), (second, start, two) = solved
+    assert start == (one.eta, one.theta)
+    assert info.dual is two
+    [(weights, policy)] = drawn
+    np.testing.assert_allclose(weights, one.weights, rtol=1e-12)
+    assert policy is not learner.policy.process
+    assert second.ridge * 480 == pytest.approx(info.ridge)
+    assert first.kl_bound == second.kl_bound == info.kl_bound
+    assert first.eta_floor == second.eta_floor == info.eta_floor
+
+
+def test_the_second_fit_of_the_policy_starts_from_the_first(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    starts: list[FloatArray] = []
+    ends: list[FloatArray] = []
+
+    def spy(loss: Any, prior: Prior, start: FloatArray) -> FloatArray:
+        starts.append(start)
+        ends.append(minimise(loss, prior, start))
+        return ends[-1]
+
+    for module in (reps, transition_model):
+        monkeypatch.setattr(module, "minimise", spy)
+    learner, info = updated(pushes())
+    assert len(starts) == 3  # of the embedding, and of the policy twice
+    np.testing.assert_array_equal(starts[2], ends[1])
+    assert learner.state.policy_start is not None
+    np.testing.assert_array_equal(learner.state.policy_start, ends[2])
+    np.testing.assert_array_equal(info.policy_parameters, np.exp(ends[2]))
+
+
+def test_the_support_is_at_most_one_point_for_each_state() -> None:
+    learner, info = updated(pushes(), imagined=20)
+    assert len(info.dual.weights) == 20 * 120
+    assert 30 < info.support <= 120
+    assert info.support == len(learner.policy.process.states)
+    seen = {s.tobytes() for r in pushes() for s in r.observations[:-1]}
+    assert {s.tobytes() for s in learner.policy.process.states} <= seen
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_it_finds_actions_beyond_those_that_the_weights_can_choose_among(seed: int) -> None:
+    """The reward is best at an action of 1, while those that were tried lie around -0.5."""
+    rng = np.random.default_rng(seed)
+    rollouts = []
+    for _ in range(15):
+        observations = rng.uniform(-1.0, 1.0, size=(9, 2))
+        actions = rng.normal(-0.5, 0.6, size=(8, 1))
+        rollouts.append(Rollout(observations, actions, -((actions[:, 0] - 1.0) ** 2)))
+    states = rng.uniform(-0.8, 0.8, size=(50, 2))
+    one, two = (
+        float(updated(rollouts, recipe=recipe)[0].policy.process.greedy(states).mean())
+        for recipe in ("observed", "default")
+    )
+    assert -0.5 < one < two < 1.3
+    assert abs(two - 1.0) < 0.7 * abs(one - 1.0)
+
+
+# ---- clipped commands -------------------------------------------------------------------------
+
+
+def test_the_share_of_clipped_commands() -> None:
+    task = TaskSpec(1, np.array([-1.0, 0.0]), np.array([1.0, 4.0]))
+    actions = np.array([[0.0, 2.0], [-1.0, 4.0], [1.5, 3.0], [-2.0, -0.1]])  # limits are within
+    assert share_clipped(actions, task) == 3.0 / 8.0
+    assert share_clipped(actions[:2], task) == 0.0
+
+
+def test_clipping_is_told_of_the_new_rollouts() -> None:
+    tame = [replace(r, actions=0.1 * r.actions) for r in pushes(4)]
+    wild = [replace(r, actions=np.sign(r.actions) * 9.0) for r in pushes(2, seed=1)]
+    learner, info = updated(tame)
+    assert info.clipped < 0.05
+    assert learner.update(wild).clipped == 1.0  # type: ignore[attr-defined]
+    data = Transitions.of([*tame, *wild])
+    np.testing.assert_array_equal(
+        new_actions(data, wild), np.concatenate([r.actions for r in wild])
+    )
+    np.testing.assert_array_equal(new_actions(data, []), data.actions)
