@@ -122,7 +122,6 @@ class Settings(OnPolicySettings):
             approximated; V has ``max_rank``.
     """
 
-    held_share: float = 0.5
     kl_bound: float = 1.0
     eta_floor: float = 0.05
     ridge: float | None = None
@@ -241,7 +240,7 @@ class NPALPSettings(OnPolicySettings):
 
 AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
 
-OBSERVED = Settings(held_share=0.0, eta_floor=0.1, ridge=0.1, imagined=0)
+OBSERVED = Settings(eta_floor=0.1, ridge=0.1, imagined=0)
 
 RECIPES: dict[str, Settings] = {
     "default": Settings(),
@@ -251,8 +250,8 @@ RECIPES: dict[str, Settings] = {
     ),
 }
 """``"paper"`` follows the printed method where it is printed, with a low floor against a vanishing
-temperature (``eta_floor=0`` takes it away).  ``"observed"`` is the printed update too, one step on
-the actions that were taken, but with the parameters that were found to learn faster.  ``"default"``
+temperature (``eta_floor=0`` takes it away).  ``"observed"`` makes one step too, on the
+actions that were taken, with the changes that were found to learn faster.  ``"default"``
 goes past the paper; docs/deviations.md says how, and what it gains."""
 
 

@@ -116,20 +116,21 @@ def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
     return markdown([*TABLE_HEADINGS, "iterations", "CPU s / update"], rows)
 
 
-MARKS = (2000, 3000, 5000, 6000, 8000, 20_000)
+MARKS = (3000, 5000, 6000, 8000, 20_000)
 """Environment steps at which learning curves are read off."""
 
 
 def at_most(curve: Sequence[Mapping[str, Any]], steps: float) -> Mapping[str, Any]:
-    """The row of the last policy that was learnt from at most so many steps (or of the first)."""
-    rows = sorted(curve, key=lambda row: float(row["steps"]))
-    return [rows[0], *(row for row in rows if float(row["steps"]) <= steps)][-1]
+    """The row of the last policy that was learnt from at most so many steps."""
+    return max(
+        (row for row in curve if float(row["steps"]) <= steps), key=lambda row: float(row["steps"])
+    )
 
 
 def read_off(curves: Sequence[Sequence[Mapping[str, Any]]], name: str, mark: float) -> str:
     """Mean and, in brackets, worst seed at a mark; a dash where the curves end before it."""
-    ends = [max(float(row["steps"]) for row in curve) for curve in curves]
-    if np.mean(ends) < 0.95 * mark:
+    steps = [[float(row["steps"]) for row in curve] for curve in curves]
+    if max(map(min, steps)) > mark or np.mean([max(s) for s in steps]) < 0.95 * mark:
         return "–"
     values = [float(at_most(curve, mark)[name]) for curve in curves]
     places = 1 if min(values) < -10.0 else 2 if min(values) < -1.0 else 3
