@@ -23,7 +23,7 @@ SEED = 100
 @cache
 def rollouts(n: int) -> list[Rollout]:
     """n steps of the swing-up by the first policy."""
-    learner = KREPS(gym.make("kreps/SwingUp-v0"), seed=SEED)
+    learner = KREPS(gym.make("kreps/SwingUp-v0"), recipe="observed", seed=SEED)
     assert learner.env is not None
     count = n // STEPS
     noises = [np.random.default_rng([SEED, j]) for j in range(count)]
@@ -35,7 +35,9 @@ def bench_update_from_many(measure: Measure) -> None:
     """Ten times the samples are to take ten times as long, and a little more."""
 
     def update(n: int) -> None:
-        KREPS(gym.make("kreps/SwingUp-v0"), seed=SEED, window=None).update(rollouts(n))
+        KREPS(gym.make("kreps/SwingUp-v0"), recipe="observed", seed=SEED, window=None).update(
+            rollouts(n)
+        )
 
     large, small = 100_000, 10_000
     measure(

@@ -46,7 +46,9 @@ class Update:
 @cache
 def next_update(iterations: int) -> Update:
     """The update of the default swing-up learner after ``iterations`` others."""
-    learner = KREPS(gym.make("kreps/SwingUp-v0"), seed=SEED).learn(iterations, progress=False)
+    learner = KREPS(gym.make("kreps/SwingUp-v0"), recipe="observed", seed=SEED).learn(
+        iterations, progress=False
+    )
     assert learner.env is not None and learner.state.policy is not None
     rollouts = collect(
         learner.env,
@@ -71,7 +73,7 @@ class SwingUpData:
 @cache
 def swing_up(n: int) -> SwingUpData:
     """The first n transitions that a default learner collects by its first policies."""
-    learner = KREPS(gym.make("kreps/SwingUp-v0"), seed=SEED, window=1000)
+    learner = KREPS(gym.make("kreps/SwingUp-v0"), recipe="observed", seed=SEED, window=1000)
     kept: list[Rollout] = []
     assert learner.env is not None
     learner.learn(3, progress=False)

@@ -64,7 +64,7 @@ def write(out: Path, name: str, content: dict[str, Any], figure: Figure, table: 
 def errors(seed: int) -> dict[str, dict[int, tuple[float, float, float]]]:
     """Of weights, V and policy, by way and rank, at the ninth update of a learner."""
     env = gym.make(TASK)
-    learner = kreps.KREPS(env, seed=seed)
+    learner = kreps.KREPS(env, seed=seed, recipe="observed")  # one step, same samples for all
     learner.learn(8, progress=False)
     state, fresh = learner.state, learner._collect(learner.env, None)
     states = np.concatenate([rollout.observations for rollout in fresh])
@@ -312,7 +312,14 @@ def walks(dimension: int, n: int = 20_000, steps: int = 50) -> list[kreps.Rollou
 
 def seconds_of_update(dimension: int, rank: int) -> dict[str, Any]:
     task = kreps.TaskSpec(dimension, [-1.0], [1.0], groups=(tuple(range(dimension)),))
-    learner = kreps.KREPS(task, window=None, approximation="uniform", rank=rank, max_rank=rank)
+    learner = kreps.KREPS(
+        task,
+        recipe="observed",
+        window=None,
+        approximation="uniform",
+        rank=rank,
+        max_rank=rank,
+    )
     rollouts = walks(dimension)
     started = time.process_time()
     info = learner.update(rollouts)

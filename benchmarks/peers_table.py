@@ -37,8 +37,7 @@ Curve = list[dict[str, Any]]
 
 def cpu_seconds(curve: Sequence[dict[str, Any]]) -> float:
     """To learn from the last mark's steps, roll-outs and updates, evaluation not counted."""
-    last = float(at_most(curve, MARKS[-1])["steps"])
-    counted = [row for row in curve if float(row["steps"]) <= last]
+    counted = [row for row in curve if float(row["steps"]) <= MARKS[-1]]
     return sum(float(r["rollout_cpu_seconds"]) + float(r["update_cpu_seconds"]) for r in counted)
 
 

@@ -395,7 +395,7 @@ problem = DualProblem(
     rewards=rewards,
     differences=reps.feature_differences(data, features, expected, settings.restart_probability),
     kl_bound=settings.kl_bound,
-    ridge=settings.ridge / n,
+    ridge=reps.stationarity_ridge(settings, None) / n,
     eta_floor=settings.eta_floor,
 )
 dual = solve_dual(problem)

@@ -22,7 +22,7 @@ from kreps.diagnosis import Finding, Trend, diagnose, trend
 from kreps.dual import Outcome
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import StorageError
-from kreps.runs import COLUMNS, NEWER, RunConfig, RunFolder, progress_row
+from kreps.runs import COLUMNS, NEWER, RunConfig, RunFolder, progress_row, rank_cap
 from kreps.settings import Settings
 
 NAME = "kreps/SwingUp-v0"
@@ -60,6 +60,7 @@ HEALTHY: dict[str, Any] = {
     "eta_floor": 0.1,
     "policy_noise": 0.4,
     "max_rank": 400,
+    "ridge": 0.02,
 }
 
 
@@ -153,10 +154,11 @@ CASES: list[tuple[str, str, str, dict[str, Any]]] = [
     ("step", "fine", "floor (0.1)", {"kl": 0.1, "outcome": "AT_FLOOR", "count": 3}),
     ("step", "fine", "60%", {"kl": 0.6, "eta": 0.1, "outcome": "AT_FLOOR"}),
     ("step", "fine", "10%", {"kl": [0.1] * 12, "outcome": ["AT_FLOOR"] * 7 + ["BOUND_ACTIVE"] * 5}),
-    ("effective samples", "limit", "29 effective", {"effective_samples": 29.0}),
-    ("effective samples", "limit", "9 effective", {"effective_samples": [500.0] * 7 + [9.0] * 5}),
+    ("effective samples", "limit", "29 effective", {"effective_samples": 29.0 * 1.6}),
+    ("effective samples", "limit", "9 effective", {"effective_samples": [500.0] * 7 + [14.4] * 5}),
     ("effective samples", "note", "4.0%", {"effective_samples": 64.0}),
-    ("effective samples", "fine", "81 effective", {"effective_samples": 81.0}),
+    ("effective samples", "fine", "51 effective", {"effective_samples": 81.0}),
+    ("effective samples", "note", "36 effective", {"effective_samples": 36.0, "weighted": 900}),
     ("transition model", "limit", "does not fall", {"model_error": 0.8}),
     ("transition model", "limit", "it falls", {"model_error": list(np.linspace(2.0, 0.9, 12))}),
     ("transition model", "note", "does not fall", {"model_error": 0.5}),
@@ -165,6 +167,8 @@ CASES: list[tuple[str, str, str, dict[str, Any]]] = [
     ("basis of V", "limit", "400", {"rank": 400, "rank_residual": 0.6}),
     ("basis of V", "note", "max_rank=800", {"rank": 400, "rank_residual": 0.2}),
     ("basis of V", "fine", "is little", {"rank": 400, "rank_residual": 0.01}),
+    ("basis of V", "note", "is not measured", {"max_rank": "nan", "rank_residual": 0.0}),
+    ("basis of V", "note", "max_rank=360", {"max_rank": "nan", "rank_residual": 0.0}),
     ("basis of V", "fine", "Complete", {"rank": 399, "rank_residual": 0.9}),
     (
         "exploration noise",
@@ -198,6 +202,7 @@ def test_every_value_stands_to_its_limit_as_the_severity_says() -> None:
         assert finding(name, **changes).value >= finding(name, **changes).limit
         assert finding(name).value < finding(name).limit
     few = finding("effective samples", effective_samples=9.0)
+    assert few.value == pytest.approx(9.0 / 1.6)
     assert few.value < few.limit == diagnosis.LEAST_EFFECTIVE
 
 
@@ -219,10 +224,30 @@ def test_settings_that_remedies_name_exist() -> None:
         Settings(**{setting: float(value) if "." in value or "e" in value else int(value)})
 
 
-@pytest.mark.parametrize(("floor", "higher"), [(0.1, "0.2"), (0.4, "0.8"), (1e-6, "0.1")])
-def test_a_higher_floor_is_higher_than_it_was(floor: float, higher: str) -> None:
+@pytest.mark.parametrize(
+    ("floor", "higher"), [(0.1, "0.2"), (0.4, "0.8"), (0.02, "0.04"), (1e-6, "0.2"), ("nan", "0.2")]
+)
+def test_a_higher_floor_is_higher_than_it_was(floor: Any, higher: str) -> None:
     found = finding("progress", average_reward=LEVEL, kl=1.0, eta_floor=floor)
     assert f"--set eta_floor={higher})" in found.remedy
+
+
+@pytest.mark.parametrize(
+    ("ridge", "larger"),
+    [(0.02, "1"), ("nan", "1"), (0.1, "1"), (0.234, "2.3"), (12.34, "120"), (5e6, "5e+07")],
+)
+def test_a_larger_ridge_is_larger_than_it_was(ridge: Any, larger: str) -> None:
+    found = finding("updates", outcome="NOT_CONVERGED", ridge=ridge)
+    assert f"--set ridge={larger})" in found.remedy
+
+
+def test_actions_imagined_in_one_state_are_no_more_to_fit_a_policy_to() -> None:
+    few = {"effective_samples": 100.0, "samples": 500}
+    assert finding("effective samples", **few, weighted=500).severity == "fine"
+    imagined = finding("effective samples", **few, weighted=2000)
+    assert imagined.severity == "limit" and imagined.value == pytest.approx(25.0)
+    # of more samples than fit in memory fewer are imagined: these are all there is
+    assert finding("effective samples", **few, weighted=250).value == pytest.approx(100.0)
 
 
 def test_a_known_local_optimum_is_named_by_the_evaluation() -> None:
@@ -364,6 +389,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         model_error=float("nan"),
         clipped=0.25,
         eta_floor=0.1,
+        ridge=0.03,
         seconds={},
     )
     learner: Any = SimpleNamespace(settings=Settings(max_rank=70))
@@ -374,6 +400,13 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
     assert set(row) == set(COLUMNS) and row["weighted"] == 4000
     assert row["policy_noise"] == pytest.approx(0.3) and row["max_rank"] == 70
     assert row["clipped"] == 0.25 and row["eta_floor"] == 0.1 and np.isnan(row["model_error"])
+    assert row["ridge"] == 0.03
+
+
+@pytest.mark.parametrize("settings", [{"features": "grid"}, {"approximation": "fourier"}])
+def test_features_of_a_fixed_number_have_no_cap(settings: dict[str, Any]) -> None:
+    assert np.isnan(rank_cap(Settings(**settings)))
+    assert rank_cap(Settings(approximation="uniform", max_rank=30)) == 30
 
 
 # ---- the page ---------------------------------------------------------------------------------
@@ -480,6 +513,7 @@ def test_the_page_holds_every_word_and_none_runs_out_of_it(changes: dict[str, An
         {"eta": 1e-6, "eta_floor": 1e-6, "kl": 0.0},
         {"average_reward": 0.0},
         {"clipped": 0.0, "policy_noise": 1e-5},
+        {"max_rank": "nan", "rank_residual": 0.0},
     ],
 )
 def test_any_run_has_a_page(changes: dict[str, Any], tmp_path: Path) -> None:
@@ -552,6 +586,19 @@ def test_references_of_another_process_are_not_used(tmp_path: Path) -> None:
     assert "local optimum" not in {f.name for f in report.diagnosis_of(folder)}
 
 
+@pytest.mark.parametrize(
+    ("recipe", "settings"),
+    [("images", {}), ("default", {"model": "sample"}), ("default", {"a": 1})],
+)
+def test_settings_of_earlier_versions_do_not_keep_references_away(
+    recipe: str, settings: dict[str, Any], tmp_path: Path
+) -> None:
+    run = write_run(tmp_path / "run", rows(average_reward=[r - 22.0 for r in LEVEL]))
+    folder = RunFolder(run)
+    folder.write_config(RunConfig(NAME, 12, 0, recipe, settings, None))
+    assert "local optimum" in {f.name for f in report.diagnosis_of(folder)}
+
+
 @pytest.mark.parametrize("suffix", [".png", ".pdf", ".svg"])
 def test_the_page_goes_where_it_is_asked_for(suffix: str, call: Call, tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", rows())
@@ -566,6 +613,7 @@ def test_pages_that_cannot_be_written_are_refused(out: str, call: Call, tmp_path
     run = write_run(tmp_path / "run", rows())
     code, text = call("diagnose", run, "--out", tmp_path / out)
     assert code == 2 and "error:" in text and Path(out).name in text
+    assert ("Fine:" in text) == (out == "missing/page.png")  # a name is looked at first
 
 
 def test_folders_that_hold_nothing_to_diagnose_are_refused(call: Call, tmp_path: Path) -> None:

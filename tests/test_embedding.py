@@ -8,6 +8,7 @@ from operator import add
 import numpy as np
 import pytest
 
+from kreps import embedding
 from kreps.arrays import FloatArray
 from kreps.embedding import (
     FeatureRegression,
@@ -149,6 +150,18 @@ def test_the_predictor_goes_on_from_what_is_expected_at_the_samples(regulariser:
     np.testing.assert_array_equal(predict(far), np.zeros((1, 6)))  # it fades to its origin
 
 
+@pytest.mark.parametrize("count", [0, 1, 7, 8, 30])
+def test_predictions_in_blocks_are_those_at_once(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(embedding, "ROWS", 8)
+    model, targets = fitted(20, 21, 0.05)
+    queries = np.random.default_rng(22).normal(size=(count, 3))
+    found = model.predictor(targets)(queries)
+    assert found.shape == (count, targets.shape[1])
+    np.testing.assert_allclose(found, model.strengths(queries).T @ targets, atol=1e-9)
+
+
 # In features of states and actions
 
 
@@ -167,7 +180,7 @@ def test_leave_one_out_errors_of_a_regression_are_those_of_refits(
         gram = psi.T @ (count[:, None] * psi) + regulariser * np.eye(6)
         coefficients = np.linalg.solve(gram, psi.T @ (count[:, None] * targets))
         wanted.append(targets[i] - psi[i] @ coefficients)
-    found = FeatureRegression.leave_one_out(psi, targets, regulariser, float(copies))
+    found = FeatureRegression.leave_one_out(psi, psi.T @ psi, targets, regulariser, float(copies))
     np.testing.assert_array_equal(found.targets, targets)
     np.testing.assert_allclose(found.errors, wanted, atol=1e-9)
 
@@ -175,7 +188,7 @@ def test_leave_one_out_errors_of_a_regression_are_those_of_refits(
 def test_leave_one_out_errors_on_all_features_are_those_of_the_embedding() -> None:
     model, targets = fitted(40, 19, 0.05)
     _, psi = RKHSBasis.fit(model.kernel, model.inputs, tolerance=1e-14, max_rank=40)
-    found = FeatureRegression.leave_one_out(psi, targets, 0.05)
+    found = FeatureRegression.leave_one_out(psi, psi.T @ psi, targets, 0.05)
     np.testing.assert_allclose(found.errors, model.leave_one_out(targets).errors, atol=1e-8)
 
 

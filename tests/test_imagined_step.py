@@ -19,18 +19,17 @@ from kreps.algorithms.reps import (
     PolicySamples,
     UpdateInfo,
     feature_differences,
-    new_actions,
     share_clipped,
     stationarity_ridge,
     successor_features,
     value_basis,
 )
 from kreps.algorithms.transition_model import fit_embedding, state_actions, state_kernel
-from kreps.arrays import FloatArray
+from kreps.arrays import FloatArray, IntArray
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.dataset import Dataset
 from kreps.dual import ETA_LEAST, DualProblem, effective_sample_size, standardise
-from kreps.embedding import KernelEmbedding, LeaveOneOut
+from kreps.embedding import FeatureRegression, KernelEmbedding, LeaveOneOut, RegressionSums
 from kreps.hyperparameters import Prior, minimise
 from kreps.kernels import Kernel, SquaredExponential
 from kreps.policies import StochasticPolicy
@@ -430,6 +429,54 @@ def test_a_set_of_samples_is_learnt_from_in_one_step(monkeypatch: pytest.MonkeyP
         updated(pushes(), approximation="pivoted")
 
 
+def test_a_sample_says_what_it_would_say_if_all_samples_were_like_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Four copies of each sample, of which one is in the sample: as if all four were there."""
+
+    def every_fourth(numbers: IntArray, rng: np.random.Generator) -> IntArray:
+        return numbers[: len(numbers) // copies]
+
+    outlooks: list[Outlook] = []
+    draw = low_rank_reps.imagine
+
+    def watch(outlook: Outlook, *others: Any) -> Any:
+        outlooks.append(outlook)
+        return draw(outlook, *others)
+
+    monkeypatch.setattr(low_rank_reps, "some", every_fourth)
+    monkeypatch.setattr(low_rank_reps, "imagine", watch)
+    fits: list[tuple[RegressionSums, float]] = []
+    fit = FeatureRegression.fit
+
+    def spy(basis: Any, sums: RegressionSums, regulariser: float) -> FeatureRegression:
+        fits.append((sums, regulariser))
+        return fit(basis, sums, regulariser)
+
+    monkeypatch.setattr(FeatureRegression, "fit", spy)
+    copies = 4
+    updated(pushes() * copies, approximation="pivoted", window=None)
+    (whole, of_whole), (part, of_part) = fits
+    assert of_part == pytest.approx(of_whole / copies)
+    np.testing.assert_allclose(copies * part.gram, whole.gram, rtol=1e-9, atol=1e-9)
+    r = whole.product.shape[1]
+    assert part.product.shape[1] == r + 1  # and the reward
+    np.testing.assert_allclose(copies * part.product[:, :r], whole.product, rtol=1e-9, atol=1e-9)
+    assert len(outlooks) == 1
+
+
+@pytest.mark.parametrize("settings", [{"imagined": 0}, {"model": "sample", "recipe": "observed"}])
+def test_no_outlook_is_made_where_nothing_is_imagined(
+    settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*arguments: Any, **named: Any) -> None:
+        raise AssertionError("an outlook")
+
+    monkeypatch.setattr(low_rank_reps, "Outlook", never)
+    _, info = updated(pushes(), approximation="pivoted", **settings)
+    assert len(info.dual.weights) == info.samples
+
+
 @pytest.mark.parametrize("approximation", ["exact", "pivoted"])
 def test_the_second_step_begins_where_the_first_one_ended(
     approximation: str, monkeypatch: pytest.MonkeyPatch
@@ -519,14 +566,27 @@ def test_the_share_of_clipped_commands() -> None:
     assert share_clipped(actions[:2], task) == 0.0
 
 
-def test_clipping_is_told_of_the_new_rollouts() -> None:
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+def test_clipping_is_told_of_the_new_rollouts(approximation: str) -> None:
     tame = [replace(r, actions=0.1 * r.actions) for r in pushes(4)]
     wild = [replace(r, actions=np.sign(r.actions) * 9.0) for r in pushes(2, seed=1)]
-    learner, info = updated(tame)
+    learner, info = updated(tame, approximation=approximation)
     assert info.clipped < 0.05
     assert learner.update(wild).clipped == 1.0  # type: ignore[attr-defined]
-    data = Transitions.of([*tame, *wild])
-    np.testing.assert_array_equal(
-        new_actions(data, wild), np.concatenate([r.actions for r in wild])
-    )
-    np.testing.assert_array_equal(new_actions(data, []), data.actions)
+    kept = np.concatenate([r.actions for r in learner.state.window.rollouts])
+    rng = np.random.default_rng(0)
+    if approximation == "exact":
+        _, again = reps.update(learner.state, [], TASK, learner.settings, rng)
+    else:
+        _, again = low_rank_reps.update(
+            learner.state, [], TASK, learner.settings, rng, learner.compute
+        )
+    assert again.clipped == share_clipped(kept, TASK) < 0.5
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+def test_new_rollouts_that_the_window_does_not_keep_are_told_too(approximation: str) -> None:
+    wild = [replace(r, actions=np.sign(r.actions) * 9.0) for r in pushes(2, seed=1)]
+    tame = [replace(r, actions=0.1 * r.actions) for r in pushes(2)]
+    _, info = updated([*wild, *tame], approximation=approximation, window=2)
+    assert info.samples == 30 and 0.5 <= info.clipped < 0.6

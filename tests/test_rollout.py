@@ -22,6 +22,7 @@ from kreps.rollout import (
     HeldNoise,
     batch_model_of,
     collect,
+    held_rows,
     simulate,
     task_of,
     without_restarts,
@@ -317,6 +318,16 @@ def test_without_a_share_of_held_noise_nothing_changes() -> None:
     ):
         np.testing.assert_array_equal(mine.actions, theirs.actions)
         np.testing.assert_array_equal(mine.observations, theirs.observations)
+
+
+@pytest.mark.parametrize("hundredths", range(101))
+def test_as_many_rollouts_hold_their_noise_as_their_share_says(hundredths: int) -> None:
+    held = held_rows(100, hundredths / 100)
+    assert len(held) == hundredths  # although 0.29 * 100 < 29
+    assert held == sorted(set(held)) and all(0 <= j < 100 for j in held)
+    for count in (1, 7, 30):
+        assert len(held_rows(count, hundredths / 100)) == hundredths * count // 100
+        assert held_rows(count, hundredths / 100) == [j for j in held if j < count]
 
 
 @pytest.mark.parametrize(

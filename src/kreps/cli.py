@@ -90,7 +90,10 @@ def train(
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same policy.")] = 0,
     recipe: Annotated[
         str,
-        typer.Option(help="default; observed: one step on the actions taken; paper: as printed."),
+        typer.Option(
+            help="default; observed: one step on the actions taken; paper: close to the printed "
+            "method."
+        ),
     ] = "default",
     set_: Annotated[
         list[str],
@@ -194,10 +197,14 @@ def diagnose(
     back; [bold]note[/bold]: worth knowing; [bold]fine[/bold]: not the cause. Only the run's files
     are read, so no environment is needed; evaluate first, and the cost of the noise is told too.
     """
+    from kreps.diagnosis_page import check_page_name
+
     folder = RunFolder(run)
     folder.config()  # complains of a folder that is no run
+    out = out or folder.path / "diagnosis.png"
+    check_page_name(out)
     findings = say_diagnosis(folder)
-    say(f"drew {draw_diagnosis(folder, findings, out or folder.path / 'diagnosis.png')}")
+    say(f"drew {draw_diagnosis(folder, findings, out)}")
 
 
 @app.command(
@@ -304,7 +311,7 @@ def reproduce(
         ),
     ],
     trials: Annotated[
-        int, typer.Option(min=1, help="Seeds: from 0, or from 400 where fresh ones confirm.")
+        int, typer.Option(min=1, help="Seeds: from 0, or from 500 where fresh ones confirm.")
     ] = 10,
     workers: WorkersOption = 2,
     iterations: Annotated[

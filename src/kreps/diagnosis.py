@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from kreps.arrays import FloatArray
-from kreps.dual import Outcome
+from kreps.dual import ETA_LEAST, Outcome
 
 Severity = Literal["limit", "note", "fine"]
 Row = Mapping[str, Any]
@@ -36,7 +36,7 @@ BOUND_USED, BOUND_UNUSED = 0.8, 0.5
 """Share of the KL bound above which it counts as used up, and below which as unused."""
 
 LEAST_EFFECTIVE, LEAST_SHARE = 30.0, 0.05
-"""Effective samples that a policy can be fitted to, and their share of all samples."""
+"""Effective targets that a policy can be fitted to, and effective samples as a share of all."""
 
 CLIPPED_NOTE = 0.9
 """Share of commands beyond the limits above which exploration is hardly felt."""
@@ -122,11 +122,25 @@ def recent(rows: Sequence[Row], name: str) -> float:
     return float(known.mean()) if len(known) else float("nan")
 
 
+def recorded(rows: Sequence[Row]) -> bool:
+    """Whether the last update was made by a version that records all columns."""
+    return bool(np.isfinite(float(rows[-1]["clipped"])))
+
+
+def weighted(rows: Sequence[Row]) -> FloatArray:
+    """Samples that were given weights, imagined ones included."""
+    found = column(rows, "weighted")
+    return np.where(np.isfinite(found), found, column(rows, "samples"))
+
+
 def effective_share(rows: Sequence[Row]) -> FloatArray:
     """Effective samples as a share of those that were given weights."""
-    weighted = [float(row.get("weighted", "nan")) for row in rows]
-    known = np.where(np.isfinite(weighted), weighted, column(rows, "samples"))
-    return column(rows, "effective_samples") / known
+    return column(rows, "effective_samples") / weighted(rows)
+
+
+def targets(rows: Sequence[Row]) -> FloatArray:
+    """What the policy can be fitted to: the actions imagined in one state make one target."""
+    return np.minimum(weighted(rows), column(rows, "samples"))
 
 
 def trend(values: FloatArray) -> Trend | None:
@@ -175,9 +189,15 @@ def diagnose(
 
 
 def higher_floor(rows: Sequence[Row]) -> str:
-    """The setting of twice the least temperature, as it may have been chosen by the learner."""
+    """The setting of twice the least temperature; of 0.2 where it is not known, or was none."""
     floor = recent(rows, "eta_floor")
-    return f"--set eta_floor={2.0 * floor if floor >= 0.05 else 0.1:.2g}"
+    return f"--set eta_floor={2.0 * floor if floor > 2.0 * ETA_LEAST else 0.2:.2g}"
+
+
+def larger_ridge(rows: Sequence[Row]) -> str:
+    """The setting of ten times the ridge, and of 1 at least."""
+    ridge = np.fmax(1.0, 10.0 * recent(rows, "ridge"))
+    return f"--set ridge={float(f'{ridge:.2g}'):g}"
 
 
 # ---- the solver -------------------------------------------------------------------------------
@@ -197,8 +217,8 @@ def updates(rows: Sequence[Row]) -> Finding:
             0.0,
             f"{_count(len(failed), 'update')} of {len(rows)} did not converge, the last one in "
             f"iteration {failed[-1]}: its weights are not certified.",
-            "a softer problem: a larger ridge (--set ridge=1), or a higher least temperature "
-            f"({higher_floor(rows)}).",
+            f"a softer problem: a larger ridge ({larger_ridge(rows)}), or a higher least "
+            f"temperature ({higher_floor(rows)}).",
         )
     if jitter > JITTER_NOTE:
         return Finding(
@@ -396,8 +416,9 @@ def step(rows: Sequence[Row]) -> Finding:
 def effective_samples(rows: Sequence[Row]) -> Finding:
     """Whether enough samples keep weight after the update."""
     name = "effective samples"
-    count = recent(rows, "effective_samples")
-    share = float(np.mean(effective_share(rows[-RECENT:])))
+    late = rows[-RECENT:]
+    count = float(np.mean(effective_share(late) * targets(late)))
+    share = float(np.mean(effective_share(late)))
     remedy = (
         "smaller steps (--set kl_bound=0.5), or more roll-outs "
         "(--set rollouts_per_iteration=20 --set window=60)."
@@ -463,12 +484,22 @@ def model(rows: Sequence[Row]) -> Finding | None:
 
 
 def basis(rows: Sequence[Row]) -> Finding | None:
-    """Whether the basis of V was cut short; None if its cap was not recorded."""
+    """Whether the basis of V was cut short; None if that was not recorded."""
     name = "basis of V"
     last = rows[-1]
     rank, cap = int(last["rank"]), float(last["max_rank"])
-    if not np.isfinite(cap):
+    if not recorded(rows):
         return None
+    if not np.isfinite(cap):
+        return Finding(
+            name,
+            "note",
+            rank,
+            cap,
+            f"V has {rank} features, a number fixed beforehand (a grid, or Fourier features): what "
+            "they leave out is not measured.",
+            f"more of them: a larger grid_size, or for Fourier features --set max_rank={2 * rank}.",
+        )
     residual = float(last["rank_residual"])
     if rank < cap:
         said = f"Complete with {rank} features of at most {cap:.0f}."

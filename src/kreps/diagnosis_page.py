@@ -174,22 +174,19 @@ def _draw_kl(axes: Axes, rows: Sequence[Row]) -> None:
 def _draw_eta(axes: Axes, rows: Sequence[Row]) -> None:
     _curve(axes, rows, column(rows, "eta"))
     axes.set_yscale("log")
-    floor = column(rows, "eta_floor")  # may change from update to update
+    floor = diagnosis.recent(rows, "eta_floor")
     low, high = float(column(rows, "eta").min()), float(column(rows, "eta").max())
-    if np.isfinite(floor).any():
-        axes.plot(column(rows, "iteration"), floor, color=GREY, lw=0.9, ls="--")
-        note = f"dashed: floor, {diagnosis.recent(rows, 'eta_floor'):.2g} of late"
-        axes.text(0.01, 0.06, note, transform=axes.transAxes, color=GREY, fontsize=7)
-        low = min(low, float(np.nanmin(floor)))
+    if np.isfinite(floor):
+        _line(axes, floor, f"floor {floor:.2g}", below=True)
+        low = min(low, floor)
     axes.set_ylim(low * (low / high / 4.0) ** 0.25, 2.0 * high)
     _plain_decades(axes)
 
 
 def _draw_effective_samples(axes: Axes, rows: Sequence[Row]) -> None:
-    share = diagnosis.effective_share(rows)
-    _curve(axes, rows, share)
-    weighted = float(rows[-1]["effective_samples"]) / float(share[-1])
-    least = max(diagnosis.LEAST_SHARE, diagnosis.LEAST_EFFECTIVE / weighted)
+    _curve(axes, rows, diagnosis.effective_share(rows))
+    targets = float(diagnosis.targets(rows)[-1])
+    least = max(diagnosis.LEAST_SHARE, diagnosis.LEAST_EFFECTIVE / targets)
     severity: Severity = "note" if least == diagnosis.LEAST_SHARE else "limit"
     text = f"{diagnosis.LEAST_SHARE:.0%}" if severity == "note" else "30 samples"
     _line(axes, least, text, COLOURS[severity])
@@ -218,10 +215,12 @@ def _draw_basis(axes: Axes, rows: Sequence[Row]) -> None:
         _line(axes, cap, f"cap {cap:.0f}")
         top = max(top, cap)
     axes.set_ylim(0.0, 1.25 * top)
+    residual = float(rows[-1]["rank_residual"])
+    fixed = diagnosis.recorded(rows) and not np.isfinite(cap)
     axes.text(
         0.99,
         0.06,
-        f"left out: {float(rows[-1]['rank_residual']):.1g}",
+        "left out: not measured" if fixed else f"left out: {residual:.1g}",
         transform=axes.transAxes,
         ha="right",
         color=GREY,

@@ -17,6 +17,9 @@ from kreps.kernels import Kernel
 from kreps.linalg import Cholesky, cholesky, solve_lower, with_diagonal
 from kreps.value import Basis
 
+ROWS = 2048
+"""Inputs predicted at once: their Gram matrix with all samples would be the largest array."""
+
 
 class TransitionModel(Protocol):
     def expected_features(self, successor_features: Array) -> Array:
@@ -84,7 +87,15 @@ class KernelEmbedding:
     def predictor(self, targets: FloatArray) -> Callable[[FloatArray], FloatArray]:
         """What is expected of targets (n, r) as a function of inputs (m, ds + da)."""
         solved = self.factor.solve(targets)
-        return lambda inputs: np.asarray(self.kernel.gram(inputs, self.inputs) @ solved)
+
+        def predict(inputs: FloatArray) -> FloatArray:
+            expected = np.empty((len(inputs), *solved.shape[1:]))
+            for first in range(0, len(inputs), ROWS):
+                block = slice(first, first + ROWS)
+                expected[block] = self.kernel.gram(inputs[block], self.inputs) @ solved
+            return expected
+
+        return predict
 
     def leave_one_out(self, targets: FloatArray) -> LeaveOneOut:
         """In closed form, of targets (n, r): ``[C^-1 F']_i / [C^-1]_ii``."""
@@ -143,16 +154,19 @@ class FeatureRegression:
 
     @staticmethod
     def leave_one_out(
-        psi: FloatArray, targets: FloatArray, regulariser: float, stands_for: float = 1.0
+        psi: FloatArray,
+        gram: FloatArray,
+        targets: FloatArray,
+        regulariser: float,
+        stands_for: float = 1.0,
     ) -> LeaveOneOut:
         """That of a regression of targets (n, r) on features psi (n, q), in closed form.
 
-        Where these are a part of the samples, each ``stands_for`` as many of them.
+        Where these are a part of the samples, each ``stands_for`` as many of them.  ``gram`` is
+        ``psi'psi``.
         """
-        sums = RegressionSums.of(psi, targets)
-        sums = RegressionSums(stands_for * sums.gram, stands_for * sums.product)
-        factor = cholesky(with_diagonal(sums.gram, regulariser))
-        residuals = targets - psi @ factor.solve(sums.product)
+        factor = cholesky(with_diagonal(stands_for * gram, regulariser))
+        residuals = targets - psi @ factor.solve(stands_for * (psi.T @ targets))
         whitened = solve_lower(factor.lower, psi.T)
         leverage = np.minimum(np.einsum("ij,ij->j", whitened, whitened), 1.0 - 1e-12)
         return LeaveOneOut(targets, residuals / (1.0 - leverage)[:, None])

@@ -14,7 +14,7 @@ from rich.table import Table
 
 from kreps.controller import Policy
 from kreps.data import TaskSpec
-from kreps.diagnosis import Finding, diagnose
+from kreps.diagnosis import Finding, diagnose, recorded
 from kreps.dual import Outcome
 from kreps.envs.references import REFERENCE_RESTART_PROBABILITY, REFERENCE_REWARDS
 from kreps.errors import ConfigurationError, EnvironmentFailure
@@ -22,7 +22,7 @@ from kreps.evaluation import EPISODES, STEPS, Evaluation, evaluate, stochastic_a
 from kreps.learner import KREPS
 from kreps.rollout import Environment, batch_model_of
 from kreps.runs import RunFolder
-from kreps.settings import settings_of
+from kreps.settings import LearnerSettings
 from kreps.storage import write_atomically
 from kreps.threads import blas_threads
 
@@ -103,7 +103,7 @@ def say_diagnosis(folder: RunFolder) -> list[Finding]:
     findings = diagnosis_of(folder)
     for finding in findings:
         say_finding(folder, finding)
-    if _rows(folder)[-1]["clipped"] == "nan":
+    if not recorded(_rows(folder)):
         say(
             "Not judged: what the version that made this run did not record (model, noise, clipped "
             "actions, cap of the basis); updates made with this one do."
@@ -130,7 +130,6 @@ def diagnosis_of(folder: RunFolder) -> list[Finding]:
 def draw_diagnosis(folder: RunFolder, findings: list[Finding], path: Path) -> Path:
     from kreps import diagnosis_page, plotting
 
-    diagnosis_page.check_page_name(path)
     page = diagnosis_page.page(
         _rows(folder),
         findings,
@@ -143,8 +142,9 @@ def draw_diagnosis(folder: RunFolder, findings: list[Finding], path: Path) -> Pa
 def _references(folder: RunFolder) -> dict[str, float]:
     """The task's reference values, where they are of the process that was learnt on."""
     config = folder.config()
-    settings = settings_of(config.recipe, **config.settings)
-    if settings.restart_probability != REFERENCE_RESTART_PROBABILITY:
+    # not all settings: those of a run of an earlier version may be none of this one
+    default = LearnerSettings.restart_probability
+    if config.settings.get("restart_probability", default) != REFERENCE_RESTART_PROBABILITY:
         return {}
     return REFERENCE_REWARDS.get(config.environment, {})
 

@@ -124,6 +124,13 @@ class HeldNoise:
         return fresh
 
 
+def held_rows(count: int, share: float) -> list[int]:
+    """A share of the numbers below ``count``, evenly among them: those that fill up a whole one."""
+    # rounded, as a product such as 0.29 * 100 falls short of the whole number that is meant
+    whole = np.floor(np.round(share * np.arange(count + 1), 9))
+    return np.flatnonzero(np.diff(whole)).tolist()
+
+
 def collect(
     env: Environment,
     task: TaskSpec,
@@ -148,11 +155,10 @@ def collect(
         DataError: it returned NaN, infinities or observations of another size.
     """
     seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
-    noises: list[Noise] = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
-    for j in range(count):
-        if round((j + 1) * held_share, 9) // 1 > round(j * held_share, 9) // 1:
-            rng = generator(seed, Purpose.POLICY, iteration, j)
-            noises[j] = HeldNoise(rng, restart_probability**-0.5)
+    rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
+    noises: list[Noise] = [*rngs]
+    for j in held_rows(count, held_share):
+        noises[j] = HeldNoise(rngs[j], restart_probability**-0.5)
     lengths = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
     return simulate(env, task, policy, seeds, noises, lengths, on_rollout)
 

@@ -27,6 +27,7 @@ from kreps.dual import Outcome
 from kreps.errors import ConfigurationError, StorageError
 from kreps.learner import KREPS, IterationReport
 from kreps.progress import seconds_by_stage
+from kreps.settings import Settings
 from kreps.storage import save_policy, write_atomically
 
 STAGES = (
@@ -47,8 +48,10 @@ NEWER = (
     "eta_floor",
     "policy_noise",
     "max_rank",
+    "ridge",
 )
-"""Columns that runs of earlier versions have not; there, and where there is no model, NaN."""
+"""Columns that runs of earlier versions have not.  There they are NaN, as is the error where there
+is no model, and the cap where the features of V are of a fixed number."""
 
 COLUMNS = (
     "iteration",
@@ -223,6 +226,12 @@ class RunFolder:
         learner.save(self.checkpoint_file)
 
 
+def rank_cap(settings: Settings) -> float:
+    """Most features of V; NaN where their number is fixed: those of a grid, or Fourier features."""
+    fixed = settings.features == "grid" or settings.approximation == "fourier"
+    return math.nan if fixed else settings.max_rank
+
+
 def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
     """One row of ``progress.csv``."""
     info, dual = report.update, report.update.dual
@@ -253,6 +262,7 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "clipped": info.clipped,
         "eta_floor": info.eta_floor,
         "policy_noise": math.sqrt(info.policy_parameters[-1]),
-        "max_rank": learner.settings.max_rank,
+        "max_rank": rank_cap(learner.settings),
+        "ridge": info.ridge,
         **{f"cpu_seconds_{s.replace(' ', '_')}": round(seconds.get(s, 0.0), 5) for s in STAGES},
     }

@@ -71,6 +71,9 @@ CHECKPOINT_ARRAYS = (
         "start.embedding",
     }
 )
+ADDED_LATER: dict[str, dict[str, Any]] = {"reps": {"imagined": 0, "held_share": 0.0}}
+"""Settings by method that earlier checkpoints have not, at the values that mean what these did."""
+
 ARRAYS = {"policy": POLICY_ARRAYS, "rollouts": ROLLOUT_ARRAYS, "checkpoint": CHECKPOINT_ARRAYS}
 
 Tensors = dict[str, FloatArray]
@@ -665,7 +668,7 @@ def load_checkpoint(
         )
     try:
         task = _task_of(header)
-        settings = settings_type(**header["settings"])
+        settings = settings_type(**{**ADDED_LATER.get(method, {}), **header["settings"]})
         counts = [header[name] for name in ("seed", "iteration", "rollouts", "steps")]
         if not all(type(count) is int and count >= 0 for count in counts):
             raise StorageError(f"seed and counts {counts} are not all whole numbers >= 0")

@@ -21,7 +21,7 @@ from kreps.policies import StochasticPolicy
 from kreps.settings import Settings
 
 MOST_IMAGINED = 20_000
-"""Samples at most: their features are held in memory."""
+"""Samples at most: what the model expects of each, a number a feature of V, is held in memory."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +45,8 @@ class Outlook:
     rewards: FloatArray
     predict: Callable[[FloatArray], FloatArray]
 
-    @classmethod
-    def targets(cls, successors: FloatArray, rewards: FloatArray) -> FloatArray:
+    @staticmethod
+    def targets(successors: FloatArray, rewards: FloatArray) -> FloatArray:
         """What `predict` is to be fitted to, (n, r + 1)."""
         return np.column_stack([successors, rewards - rewards.mean()])
 
@@ -95,12 +95,12 @@ def imagine(
     rows = resample(weights, count, rng)
     states = outlook.states[rows]
     actions = policy.act(states, rng.standard_normal((count, task.action_size)))
-    said = outlook.predict(np.concatenate([states, task.scaled(task.clip(actions))], axis=1))
+    predicted = outlook.predict(np.concatenate([states, task.scaled(task.clip(actions))], axis=1))
     # a regression may overshoot what was ever observed, and would be believed
     observed = outlook.rewards
-    rewards = np.clip(observed.mean() + said[:, -1], observed.min(), observed.max())
+    rewards = np.clip(observed.mean() + predicted[:, -1], observed.min(), observed.max())
     p = settings.restart_probability
-    expected = outlook.origin[rows] + said[:, :-1]
+    expected = outlook.origin[rows] + predicted[:, :-1]
     problem = DualProblem(
         rewards=rewards - rewards.max(),
         differences=(1.0 - p) * expected + p * outlook.start - outlook.features[rows],

@@ -119,7 +119,7 @@ def update(
     # Eq. 4: the expected features of each successor, linear in features of state and action
     bases = [basis]
     from_own = settings.model == "change"
-    model, errors, outlook, embedding_start = None, None, None, None
+    model, errors, embedding_start = None, None, None
     if settings.model != "sample":
         inputs = state_actions(sample, task)
         own, after = replace(changes, place=as_float).both(sample)
@@ -131,19 +131,13 @@ def update(
         clock.lap("embedding fit")
         embedded = choose_basis(joint_kernel, inputs, settings, settings.rank, rng)
         bases.append(embedded)
-        says = EmbeddingSums(changes, embedded, task, from_own)
-        sums = reduce(add, compute.map(says, dataset.chunks))
-        model = FeatureRegression.fit(embedded, sums, regulariser)
+        sums_of = EmbeddingSums(changes, embedded, task, from_own)
+        embedding_sums = reduce(add, compute.map(sums_of, dataset.chunks))
+        model = FeatureRegression.fit(embedded, embedding_sums, regulariser)
         psi = embedded.features(inputs)
-        errors = FeatureRegression.leave_one_out(psi, successors, regulariser, n / len(sample))
-        said = RegressionSums.of(psi, Outlook.targets(successors, rewards[sampled]))
-        outlook = Outlook(
-            states=sample.states,
-            features=own,
-            origin=origin,
-            start=changes.start,
-            rewards=rewards[sampled],
-            predict=FeatureRegression.fit(embedded, said, regulariser).mean,
+        gram = psi.T @ psi
+        errors = FeatureRegression.leave_one_out(
+            psi, gram, successors, regulariser, n / len(sample)
         )
     clock.lap("embedding")
 
@@ -176,23 +170,33 @@ def update(
     x = policy_hyperparameters(support, kernel, settings, state.policy_start, rng)
     clock.lap("policy fit")
     centres = policy_centres(support, kernel, x, settings, rng)
-    says_of_policy = ChunkPolicySums(centres, task, place)
-    spoken = reduce(add, compute.map(says_of_policy, dataset.chunks, dataset.split(weights)))
-    policy = fit_sparse(task, centres, spoken, x)
+    policy_sums_of = ChunkPolicySums(centres, task, place)
+    policy_sums = reduce(add, compute.map(policy_sums_of, dataset.chunks, dataset.split(weights)))
+    policy = fit_sparse(task, centres, policy_sums, x)
     clock.lap("policy")
 
     # the same once more, for other actions in the states of the sample
-    if settings.imagined and outlook is not None and seen is not None:
+    if settings.imagined and model is not None and seen is not None:
+        outlook_sums = RegressionSums(gram, psi.T @ Outlook.targets(successors, rewards[sampled]))
+        of_sample = FeatureRegression.fit(embedded, outlook_sums, regulariser * len(sample) / n)
+        outlook = Outlook(
+            states=sample.states,
+            features=own,
+            origin=origin,
+            start=changes.start,
+            rewards=rewards[sampled],
+            predict=of_sample.mean,
+        )
         share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
         dual = solve_dual(imagined.problem, start=(dual.eta, dual.theta))
         support = PolicySamples.imagined(sample, imagined, dual.weights, task)
         x = policy_hyperparameters(support, kernel, settings, x, rng)
         centres = policy_centres(support, kernel, x, settings, rng)
-        features = centres.features(support.states)
-        policy = fit_sparse(
-            task, centres, PolicySums.of(features, support.weights, support.targets), x
+        policy_sums = PolicySums.of(
+            centres.features(support.states), support.weights, support.targets
         )
+        policy = fit_sparse(task, centres, policy_sums, x)
         clock.lap("imagined step")
     bases.append(centres)
 
@@ -204,15 +208,14 @@ def update(
         embedding_start=embedding_start,
         policy_start=x,
     )
+    acted = [r.actions for r in newest or window.rollouts] if seen is not None else [sample.actions]
     info = UpdateInfo(
         samples=n,
         kl_bound=settings.kl_bound,
         eta_floor=problem.eta_floor,
         ridge=ridge,
         model_error=float("nan") if errors is None else errors.relative,
-        clipped=share_clipped(
-            np.concatenate([r.actions for r in newest]) if newest else sample.actions, task
-        ),
+        clipped=share_clipped(np.concatenate(acted), task),
         rank=problem.rank,
         rank_residual=basis.residual,
         dual=dual,

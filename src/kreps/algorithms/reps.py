@@ -57,7 +57,8 @@ class UpdateInfo:
         ridge: rho times the number of samples.
         model_error: of the transition model by leave-one-out, relative (`LeaveOneOut.relative`);
             nan without a model.
-        clipped: share of the commanded actions of the new samples that lie beyond the limits.
+        clipped: share of the commanded actions that lie beyond the limits: those of the new
+            roll-outs, of all kept ones if there are none, or of a data set's sample.
         rank: features of V; ``rank_residual`` is the largest squared residual they leave.
         dual: the last step's solution with its certificate.
         effective_samples: effective sample size of the weights.
@@ -190,7 +191,9 @@ def update(
         eta_floor=problem.eta_floor,
         ridge=ridge,
         model_error=float("nan") if errors is None else errors.relative,
-        clipped=share_clipped(new_actions(data, rollouts), task),
+        clipped=share_clipped(
+            np.concatenate([r.actions for r in rollouts or window.rollouts]), task
+        ),
         rank=features.shape[1],
         rank_residual=basis.residual,
         dual=dual,
@@ -262,11 +265,6 @@ def stationarity_ridge(settings: Settings, errors: LeaveOneOut | None) -> float:
         return settings.ridge
     assert errors is not None  # settings without a model name a ridge
     return max(errors.mean_square, RIDGE_LEAST)
-
-
-def new_actions(data: Transitions, rollouts: Sequence[Rollout]) -> FloatArray:
-    """Commanded actions (n, da) of the newest roll-outs, or of all if there are no new ones."""
-    return data.actions[-sum(map(len, rollouts)) :]
 
 
 def share_clipped(actions: FloatArray, task: TaskSpec) -> float:
