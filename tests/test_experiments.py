@@ -182,7 +182,7 @@ def test_the_committed_search_is_of_the_candidates_of_today() -> None:
 
 def test_the_candidates_mean_what_they_meant_in_the_committed_search() -> None:
     """It was made when the recipe "observed" was the default, so that no candidate named it."""
-    numbers = {"kl_bound": 1.0, "eta_floor": 0.1, "ridge": 0.1, "imagined": 0, "held_share": 0.0}
+    numbers = {"kl_bound": 1.0, "eta_floor": 0.1, "ridge": 0.1, "imagined": 0}
     for task, methods in search.CANDIDATES.items():
         for method, candidates in methods.items():
             if METHODS[method].learner != "reps":

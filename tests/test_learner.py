@@ -60,7 +60,6 @@ def collected(learner: kreps.KREPS, policy: StochasticPolicy, iteration: int) ->
         seed=0,
         iteration=iteration,
         restart_probability=0.02,
-        held_share=0.0 if iteration else learner.settings.held_share,
     )
 
 

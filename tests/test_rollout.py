@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import gymnasium as gym
@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps import rollout as rollout_module
 from kreps.algorithms.reps import LearnerState
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec
@@ -18,15 +17,7 @@ from kreps.envs.swing_up import SwingUp
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
 from kreps.evaluation import discounted_average
 from kreps.policies import BangBang, StochasticPolicy
-from kreps.rollout import (
-    HeldNoise,
-    batch_model_of,
-    collect,
-    held_rows,
-    simulate,
-    task_of,
-    without_restarts,
-)
+from kreps.rollout import batch_model_of, collect, simulate, task_of, without_restarts
 from kreps.seeding import Purpose, generator, integer_seed
 
 TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
@@ -120,7 +111,6 @@ def collected(
     seed: int = 0,
     iteration: int = 0,
     probability: float = 0.05,
-    **changes: Any,
 ) -> list[Rollout]:
     return collect(
         env,
@@ -130,7 +120,6 @@ def collected(
         seed=seed,
         iteration=iteration,
         restart_probability=probability,
-        **changes,
     )
 
 
@@ -264,128 +253,6 @@ def test_real_ends_in_a_batch_stop_their_own_rollout_only() -> None:
     assert [len(r) for r in rollouts] == [1, 3, 3, 2]
     assert [r.terminated for r in rollouts] == [False, True, True, False]
     np.testing.assert_array_equal(rollouts[1].observations[:, 0], [0.0, 1.0, 2.0, 3.0])
-
-
-# ---- noise that is held -----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_held_noise_changes_as_often_as_was_drawn(seed: int) -> None:
-    longest, steps = 50.0, 20_000
-    often = np.exp(-np.random.default_rng(seed).uniform(0.0, np.log(longest)))
-    assert 1.0 / longest <= often <= 1.0
-    noise = HeldNoise(np.random.default_rng(seed), longest)
-    values = np.array([noise.standard_normal(2) for _ in range(steps)])
-    changes = values[1:] != values[:-1]
-    error = 5.0 * np.sqrt(often / steps)
-    np.testing.assert_allclose(changes.mean(axis=0), often, atol=error)
-    both = (changes[:, 0] & changes[:, 1]).mean()  # each coordinate in its own time
-    assert both == pytest.approx(often**2, abs=error)
-    # what is new has the moments of a standard normal
-    fresh = values[1:][changes]
-    assert len(fresh) > 400
-    assert fresh.mean() == pytest.approx(0.0, abs=5.0 / np.sqrt(len(fresh)))
-    assert fresh.std() == pytest.approx(1.0, abs=5.0 / np.sqrt(2.0 * len(fresh)))
-
-
-def test_the_mean_time_is_drawn_evenly_on_a_logarithmic_scale() -> None:
-    """Between one step and the longest: the share of values that stay is known."""
-    longest, count, steps = 50.0, 300, 100
-    stay = 0
-    for seed in range(count):
-        noise = HeldNoise(np.random.default_rng(seed), longest)
-        values = np.array([float(noise.standard_normal(1)[0]) for _ in range(steps)])
-        stay += int((values[1:] == values[:-1]).sum())
-    share = stay / (count * (steps - 1))
-    # the mean of exp(-u) for u uniform in [0, log longest]
-    assert share == pytest.approx(1.0 - (1.0 - 1.0 / longest) / np.log(longest), abs=0.08)
-
-
-def test_noise_that_is_never_held_is_white() -> None:
-    noise = HeldNoise(np.random.default_rng(0), 1.0)
-    values = np.array([float(noise.standard_normal((1, 1))[0, 0]) for _ in range(4000)])
-    assert len(np.unique(values)) == 4000
-    assert values.std() == pytest.approx(1.0, abs=5.0 / np.sqrt(8000.0))
-    lagged = np.mean(values[1:] * values[:-1])
-    assert lagged == pytest.approx(0.0, abs=5.0 / np.sqrt(4000.0))
-
-
-def test_without_a_share_of_held_noise_nothing_changes() -> None:
-    env = gym.make("kreps/SwingUp-v0")
-    policy = Linear(20.0)
-    for mine, theirs in zip(
-        collected(env, policy), collected(env, policy, held_share=0.0), strict=True
-    ):
-        np.testing.assert_array_equal(mine.actions, theirs.actions)
-        np.testing.assert_array_equal(mine.observations, theirs.observations)
-
-
-@pytest.mark.parametrize("hundredths", range(101))
-def test_as_many_rollouts_hold_their_noise_as_their_share_says(hundredths: int) -> None:
-    held = held_rows(100, hundredths / 100)
-    assert len(held) == hundredths  # although 0.29 * 100 < 29
-    assert held == sorted(set(held)) and all(0 <= j < 100 for j in held)
-    for count in (1, 7, 30):
-        assert len(held_rows(count, hundredths / 100)) == hundredths * count // 100
-        assert held_rows(count, hundredths / 100) == [j for j in held if j < count]
-
-
-@pytest.mark.parametrize(
-    ("share", "held"), [(0.5, [1, 3, 5, 7]), (0.25, [3, 7]), (1.0, list(range(8)))]
-)
-def test_the_share_of_rollouts_with_held_noise_is_spread_evenly(
-    share: float, held: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    longest: list[float] = []
-
-    def spy(rng: np.random.Generator, most: float) -> HeldNoise:
-        longest.append(most)
-        return HeldNoise(rng, most)
-
-    monkeypatch.setattr(rollout_module, "HeldNoise", spy)
-    env = gym.make("kreps/SwingUp-v0")
-    policy = BangBang(task_of(env))
-    white = collected(env, policy, 8, probability=0.02)
-    found = collected(env, policy, 8, probability=0.02, held_share=share)
-    assert len(longest) == len(held)
-    assert len(set(longest)) == 1 and 1.0 < longest[0] <= 50.0  # no longer than a roll-out
-    for j, (one, other) in enumerate(zip(white, found, strict=True)):
-        assert len(one) == len(other)
-        np.testing.assert_array_equal(one.observations[0], other.observations[0])
-        if j not in held:
-            np.testing.assert_array_equal(one.actions, other.actions)
-            continue
-        noise = HeldNoise(generator(0, Purpose.POLICY, 0, j), longest[0])
-        signs = [float(noise.standard_normal(1)[0]) < 0 for _ in range(len(other))]
-        np.testing.assert_array_equal(other.actions[:, 0] < 0, signs)
-    moved = sum(not np.array_equal(a.actions, b.actions) for a, b in zip(white, found, strict=True))
-    assert moved == len(held)
-
-
-def test_held_noise_is_the_same_in_batches_and_step_by_step() -> None:
-    env = gym.make("kreps/SwingUp-v0")
-    wrapped: gym.Env[Any, Any] = gym.Wrapper(env)
-    assert batch_model_of(wrapped) is None
-    policy = Linear(20.0)
-    batch, single = (collected(each, policy, held_share=1.0) for each in (env, wrapped))
-    for mine, theirs in zip(batch, single, strict=True):
-        np.testing.assert_allclose(mine.actions, theirs.actions, atol=1e-9)
-
-
-def test_only_the_first_rollouts_hold_their_noise() -> None:
-    policies = [
-        kreps.KREPS(gym.make("kreps/SwingUp-v0"), held_share=share, **TINY) for share in (0.0, 1.0)
-    ]
-    first = [learner.learn(1, progress=False).state for learner in policies]
-    changes = [
-        np.mean(np.concatenate([np.diff(r.actions[:, 0]) != 0 for r in state.window.rollouts]))
-        for state in first
-    ]
-    assert changes[1] < changes[0] - 0.1  # of bang-bang control, which changes at half the steps
-    policies[1].state = replace(policies[1].state, policy=policies[0].state.policy)
-    later = [learner.learn(1, progress=False).state.window.rollouts[3:] for learner in policies]
-    for mine, theirs in zip(*later, strict=True):
-        np.testing.assert_array_equal(mine.actions, theirs.actions)
 
 
 def test_progress_of_collecting_is_told() -> None:

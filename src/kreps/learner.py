@@ -315,7 +315,6 @@ class OnPolicyLearner(Learner[OnPolicy]):
             seed=self.seed,
             iteration=self.state.iteration,
             restart_probability=settings.restart_probability,
-            held_share=settings.held_share if first else 0.0,
             on_rollout=on_rollout,
         )
 

@@ -6,7 +6,7 @@ Both ways address their randomness by roll-out, so they give the same data from 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -92,45 +92,6 @@ def batch_model_of(env: Environment) -> BatchModel | None:
     return None
 
 
-class Noise(Protocol):
-    """Where a roll-out's policy noise comes from: a generator, or something in its place."""
-
-    def standard_normal(self, size: Any) -> FloatArray: ...
-
-
-class HeldNoise:
-    """Standard normal noise of which each coordinate stays the same for a random time.
-
-    White noise averages out over a few steps, so that a system with some inertia hardly leaves its
-    start.  How long it has to be pushed is not known beforehand, so each roll-out draws its own
-    mean time.
-
-    Args:
-        rng: of the noise.
-        longest: the mean time in steps is log-uniform between one and this.
-    """
-
-    def __init__(self, rng: np.random.Generator, longest: float) -> None:
-        self._rng = rng
-        self._change = float(np.exp(-rng.uniform(0.0, np.log(longest))))
-        self._held: FloatArray | None = None
-
-    def standard_normal(self, size: Any) -> FloatArray:
-        fresh = self._rng.standard_normal(size)
-        if self._held is not None:
-            changes = self._rng.uniform(size=size) < self._change
-            fresh = np.where(changes, fresh, self._held)
-        self._held = fresh
-        return fresh
-
-
-def held_rows(count: int, share: float) -> list[int]:
-    """A share of the numbers below ``count``, evenly among them: those that fill up a whole one."""
-    # rounded, as a product such as 0.29 * 100 falls short of the whole number that is meant
-    whole = np.floor(np.round(share * np.arange(count + 1), 9))
-    return np.flatnonzero(np.diff(whole)).tolist()
-
-
 def collect(
     env: Environment,
     task: TaskSpec,
@@ -140,14 +101,11 @@ def collect(
     seed: int,
     iteration: int,
     restart_probability: float,
-    held_share: float = 0.0,
     on_rollout: Callable[[int], None] | None = None,
 ) -> list[Rollout]:
     """``count`` roll-outs of random length, as the paper's protocol collects them.
 
     Args:
-        held_share: share of the roll-outs whose noise is held, evenly among them; for a mean time
-            of at most the root of a roll-out's length, so that each tries several actions.
         on_rollout: called with the number of roll-outs that are complete.
 
     Raises:
@@ -155,10 +113,7 @@ def collect(
         DataError: it returned NaN, infinities or observations of another size.
     """
     seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
-    rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
-    noises: list[Noise] = [*rngs]
-    for j in held_rows(count, held_share):
-        noises[j] = HeldNoise(rngs[j], restart_probability**-0.5)
+    noises = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
     lengths = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
     return simulate(env, task, policy, seeds, noises, lengths, on_rollout)
 
@@ -255,7 +210,7 @@ def simulate(
     task: TaskSpec,
     policy: StochasticPolicy,
     seeds: Sequence[int],
-    noises: Sequence[Noise],
+    noises: Sequence[np.random.Generator],
     lengths: Sequence[int],
     on_rollout: Callable[[int], None] | None = None,
 ) -> list[Rollout]:
@@ -279,7 +234,7 @@ def _simulate_batch(
     task: TaskSpec,
     policy: StochasticPolicy,
     seeds: Sequence[int],
-    noises: Sequence[Noise],
+    noises: Sequence[np.random.Generator],
     lengths: Sequence[int],
 ) -> list[Rollout]:
     rngs = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
@@ -320,7 +275,7 @@ def _simulate_one(
     task: TaskSpec,
     policy: StochasticPolicy,
     seed: int,
-    noise: Noise,
+    noise: np.random.Generator,
     length: int,
     number: int,
 ) -> Rollout:

@@ -68,16 +68,12 @@ class OnPolicySettings(LearnerSettings):
     Attributes:
         exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``.
         exploration_scale: standard deviation of the Gaussian one, in units of half the range.
-        held_share: share of the first roll-outs whose noise is held for a random time, on average
-            from one step to the root of a roll-out's length: white noise hardly moves what has
-            some inertia.
         initial_rollouts: roll-outs of the first policy.
         rollouts_per_iteration: roll-outs of the current policy before each later update.
     """
 
     exploration: Exploration = "bang-bang"
     exploration_scale: float = 1.0
-    held_share: float = 0.0
     initial_rollouts: int = 30
     rollouts_per_iteration: int = 10
 
@@ -85,7 +81,6 @@ class OnPolicySettings(LearnerSettings):
         super().__post_init__()
         self._choose("exploration", Exploration)
         self._positive("exploration_scale")
-        self._check("held_share", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
         self._whole("initial_rollouts", "rollouts_per_iteration")
 
 
