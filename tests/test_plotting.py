@@ -33,6 +33,7 @@ def rows(count: int) -> list[dict[str, str]]:
             "kl_bound": "1.0",
             "effective_samples": str(20.0 + i),
             "samples": "100",
+            "weighted": "100",
         }
         for i in range(count)
     ]
