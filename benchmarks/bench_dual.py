@@ -9,7 +9,7 @@ from criteria import Seconds, Share
 from data import swing_up
 from measuring import Measure
 
-from kreps.algorithms.reps import feature_differences
+from kreps.algorithms.reps import feature_differences, stationarity_ridge
 from kreps.algorithms.transition_model import state_kernel, successor_features
 from kreps.arrays import FloatArray
 from kreps.dual import DualProblem, Moments, solve_dual, standardise
@@ -62,7 +62,7 @@ def bench_newton_solve(measure: Measure) -> None:
         rewards,
         feature_differences(transitions, features, successor_features(transitions, features), 0.02),
         observed.kl_bound,
-        (observed.ridge or 0.0) / len(rewards),
+        stationarity_ridge(observed, None) / len(rewards),
         observed.eta_floor,
     )
     count = hessians(problem)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
+from math import inf
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, TypeVar, get_args
 
@@ -14,7 +15,6 @@ Approximation = Literal["auto", "exact", "pivoted", "uniform", "fourier"]
 Features = Literal["rkhs", "grid"]
 PolicyFit = Literal["map", "bounded"]
 Exploration = Literal["bang-bang", "gaussian"]
-INFINITY = float("inf")
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class LearnerSettings:
 
     def _positive(self, *names: str) -> None:
         for name in names:
-            self._check(name, Real, "positive and finite", lambda v: 0 < v < INFINITY)
+            self._check(name, Real, "positive and finite", lambda v: 0 < v < inf)
 
     def _whole(self, *names: str) -> None:
         for name in names:
@@ -138,8 +138,8 @@ class Settings(OnPolicySettings):
         self._choose("approximation", Approximation)
         self._positive("kl_bound", "basis_tolerance")
         if self.ridge is not None:
-            self._check("ridge", Real, "positive and finite, or None", lambda v: 0 < v < INFINITY)
-        self._check("eta_floor", Real, "finite and >= 0", lambda v: 0 <= v < INFINITY)
+            self._check("ridge", Real, "positive and finite, or None", lambda v: 0 < v < inf)
+        self._check("eta_floor", Real, "finite and >= 0", lambda v: 0 <= v < inf)
         self._check("imagined", Integral, "a whole number >= 0", lambda v: v >= 0)
         self._whole("max_rank", "grid_size", "rank")
         if self.model == "sample" and (self.imagined or self.ridge is None):
