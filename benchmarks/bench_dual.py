@@ -9,8 +9,12 @@ from criteria import Seconds, Share
 from data import swing_up
 from measuring import Measure
 
-from kreps.algorithms.reps import feature_differences, stationarity_ridge
-from kreps.algorithms.transition_model import state_kernel, successor_features
+from kreps.algorithms.reps import stationarity_ridge
+from kreps.algorithms.transition_model import (
+    feature_differences,
+    state_kernel,
+    successor_features,
+)
 from kreps.arrays import FloatArray
 from kreps.dual import DualProblem, Moments, solve_dual, standardise
 from kreps.settings import RECIPES
@@ -60,7 +64,12 @@ def bench_newton_solve(measure: Measure) -> None:
     rewards, _ = standardise(transitions.rewards)
     problem = DualProblem(
         rewards,
-        feature_differences(transitions, features, successor_features(transitions, features), 0.02),
+        feature_differences(
+            features[transitions.state],
+            successor_features(transitions, features),
+            features[transitions.start].mean(axis=0),
+            0.02,
+        ),
         observed.kl_bound,
         stationarity_ridge(observed, None) / len(rewards),
         observed.eta_floor,

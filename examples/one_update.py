@@ -24,7 +24,11 @@ from PIL import Image
 
 from kreps.algorithms import reps
 from kreps.algorithms.state import LearnerState
-from kreps.algorithms.transition_model import state_kernel, successor_features
+from kreps.algorithms.transition_model import (
+    feature_differences,
+    state_kernel,
+    successor_features,
+)
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Window
 from kreps.dual import (
@@ -390,10 +394,11 @@ show(figure, "3_embedding")
 # `eta` is never lowered; here it is not needed.
 
 # %%
+own, starts = features[data.state], features[data.start].mean(axis=0)
 rewards, reward_unit = standardise(data.rewards)
 problem = DualProblem(
     rewards=rewards,
-    differences=reps.feature_differences(data, features, expected, settings.restart_probability),
+    differences=feature_differences(own, expected, starts, settings.restart_probability),
     kl_bound=settings.kl_bound,
     ridge=reps.stationarity_ridge(settings, None) / n,
     eta_floor=settings.eta_floor,

@@ -18,13 +18,18 @@ from kreps.algorithms.reps import (
     RIDGE_LEAST,
     PolicySamples,
     UpdateInfo,
-    feature_differences,
     share_clipped,
     stationarity_ridge,
-    successor_features,
     value_basis,
 )
-from kreps.algorithms.transition_model import fit_embedding, state_actions, state_kernel
+from kreps.algorithms.transition_model import (
+    feature_differences,
+    fit_embedding,
+    restart_features,
+    state_actions,
+    state_kernel,
+    successor_features,
+)
 from kreps.arrays import FloatArray, IntArray
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.dataset import Dataset
@@ -145,7 +150,11 @@ class Case:
             states=self.data.states,
             features=self.features[self.data.state],
             origin=self.origin,
-            start=self.features[self.data.start].mean(axis=0),
+            restart=restart_features(
+                self.features[self.data.start].mean(axis=0),
+                self.features[self.data.state].mean(axis=0),
+                self.settings,
+            ),
             rewards=self.rewards,
             predict=says if predict is None else predict,
         )
@@ -175,7 +184,8 @@ def test_of_the_observed_actions_the_model_says_what_the_first_step_was_told(mod
     np.testing.assert_array_equal(found.actions, data.actions)
     expected = case.origin + case.model.expected_features(case.successors)
     p = case.settings.restart_probability
-    wanted = feature_differences(data, case.features, expected, p)
+    outlook = case.outlook()
+    wanted = feature_differences(outlook.features, expected, outlook.restart, p)
     assert np.abs(wanted).max() > 0.1
     np.testing.assert_allclose(found.problem.differences, wanted, atol=1e-8)
     mean = case.rewards.mean()

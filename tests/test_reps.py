@@ -15,14 +15,17 @@ from kreps.algorithms.reps import (
     LearnerState,
     PolicySamples,
     UpdateInfo,
-    feature_differences,
     policy_hyperparameters,
-    successor_features,
     update,
+)
+from kreps.algorithms.transition_model import (
+    feature_differences,
+    restart_features,
+    successor_features,
 )
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window
-from kreps.dual import KL_TOLERANCE, Outcome, kl_from_uniform
+from kreps.dual import KL_TOLERANCE, DualProblem, Outcome, kl_from_uniform, solve_dual
 from kreps.errors import DataError
 from kreps.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel, factors_of
@@ -508,11 +511,42 @@ def test_after_an_end_the_successor_is_the_mean_start() -> None:
 def test_the_restart_mixes_the_expectation_with_the_mean_start(restart: float) -> None:
     data, features = transitions(terminated=False)
     expected = np.random.default_rng(12).normal(size=(len(data), 5))
-    found = feature_differences(data, features, expected, restart)
+    own, starts = features[data.state], features[data.start].mean(axis=0)
+    found = feature_differences(own, expected, starts, restart)
     mean_start = (features[0] + features[5] + features[10] + features[15]) / 4.0
     for i, row in enumerate(found):
         wanted = (1.0 - restart) * expected[i] + restart * mean_start - features[data.state[i]]
         np.testing.assert_allclose(row, wanted, atol=1e-14)
+
+
+def test_a_share_of_the_restarts_is_in_the_sampled_states() -> None:
+    starts, states = np.array([1.0, 0.0]), np.array([0.0, 4.0])
+    for share, wanted in [(0.0, [1.0, 0.0]), (0.25, [0.75, 1.0]), (1.0, [0.0, 4.0])]:
+        found = restart_features(starts, states, Settings(exploring_starts=share))
+        np.testing.assert_array_equal(found, wanted)
+
+
+def test_exploring_starts_settle_what_to_do_beside_the_way() -> None:
+    """Two states: to stay in the first pays, and only from there may the second be reached."""
+    eye = np.eye(2)
+    state, after = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
+    stay, leave, back, remain = range(4)
+    rewards = np.array([0.0, -1.0, -1.0, -1.0])
+    found = {}
+    for share in (0.0, 0.25):
+        restart = restart_features(
+            eye[0], eye[state].mean(axis=0), Settings(exploring_starts=share)
+        )
+        differences = feature_differences(eye[state], eye[after], restart, 0.1)
+        problem = DualProblem(rewards, differences, kl_bound=2.0, ridge=1e-6, eta_floor=0.05)
+        found[share] = solve_dual(problem).weights
+    for p in found.values():
+        assert p[stay] > 0.9
+        assert p[leave] < 1e-3
+    assert found[0.0][[back, remain]].sum() < 1e-4
+    beside = 0.1 * 0.25 * 0.5  # restarts there, and it is left at once
+    assert found[0.25][back] == pytest.approx(beside, rel=0.1)
+    assert found[0.25][remain] < 0.1 * found[0.25][back]
 
 
 def test_policy_samples_drop_what_weighs_next_to_nothing() -> None:

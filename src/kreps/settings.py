@@ -98,6 +98,8 @@ class Settings(OnPolicySettings):
         ridge: rho times the number of samples; the softness of the stationarity constraint.  None
             takes the mean squared leave-one-out error of the transition model: stationarity is
             asked for as strictly as successors can be predicted.
+        exploring_starts: share of the restarts that an update places in any of the sampled states
+            instead of the start states, so that V and the policy are right beside the way, too.
         imagined: actions per state that are drawn anew for a second bounded step, in which the
             model says what they lead to; 0 leaves that step out.
         model: transition model: ``"change"`` embeds how the features change, so that far from the
@@ -120,6 +122,7 @@ class Settings(OnPolicySettings):
     kl_bound: float = 1.0
     eta_floor: float = 0.05
     ridge: float | None = None
+    exploring_starts: float = 0.25
     imagined: int = 4
     model: Model = "change"
     features: Features = "rkhs"
@@ -140,6 +143,7 @@ class Settings(OnPolicySettings):
         if self.ridge is not None:
             self._check("ridge", Real, "positive and finite, or None", lambda v: 0 < v < inf)
         self._check("eta_floor", Real, "finite and >= 0", lambda v: 0 <= v < inf)
+        self._check("exploring_starts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
         self._check("imagined", Integral, "a whole number >= 0", lambda v: v >= 0)
         self._whole("max_rank", "grid_size", "rank")
         if self.model == "sample" and (self.imagined or self.ridge is None):
@@ -235,7 +239,7 @@ class NPALPSettings(OnPolicySettings):
 
 AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
 
-OBSERVED = Settings(eta_floor=0.1, ridge=0.1, imagined=0)
+OBSERVED = Settings(eta_floor=0.1, ridge=0.1, exploring_starts=0.0, imagined=0)
 
 RECIPES: dict[str, Settings] = {
     "default": Settings(),

@@ -114,13 +114,14 @@ class EmbeddingSums:
 
 @dataclass(frozen=True)
 class BellmanRows:
-    """Rows ``B = (1 - p) E[phi(s') | s_i, a_i] + p mean_k phi(s0_k) - phi(s_i)`` of a chunk.
+    """Rows ``B = (1 - p) E[phi(s') | s_i, a_i] + p phi_restart - phi(s_i)`` of a chunk.
 
     Attributes:
         changes: features of V.
         model: the fitted embedding, or None for the observed successor.
         task: limits and scale of the actions.
         from_own: whether the model's successors are counted from the state's own features.
+        restart: (r,) mean features of the states that the process restarts in.
         restart_probability: p.
     """
 
@@ -128,6 +129,7 @@ class BellmanRows:
     model: FeatureRegression | None
     task: TaskSpec
     from_own: bool
+    restart: FloatArray
     restart_probability: float
 
     def __call__(self, data: Transitions) -> Array:
@@ -140,7 +142,7 @@ class BellmanRows:
             if self.from_own:
                 expected += own
         expected *= 1.0 - p
-        expected += p * like(self.changes.start, own)
+        expected += p * like(self.restart, own)
         expected -= own
         return expected
 

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kreps.algorithms.transition_model import feature_differences
 from kreps.arrays import FloatArray, IntArray
 from kreps.data import TaskSpec
 from kreps.dual import ETA_LEAST, DualProblem
@@ -32,7 +33,7 @@ class Outlook:
         states: (n, ds).
         features: (n, r) of V there.
         origin: (n, r) what expected features are counted from.
-        start: (r,) mean features of the start states.
+        restart: (r,) mean features of the states that the process restarts in.
         rewards: (n,) observed, standardised.
         predict: maps states and scaled actions (m, ds + da) to expected features of the successor,
             counted from the origin, and in a last column the reward, counted from its mean.
@@ -41,7 +42,7 @@ class Outlook:
     states: FloatArray
     features: FloatArray
     origin: FloatArray
-    start: FloatArray
+    restart: FloatArray
     rewards: FloatArray
     predict: Callable[[FloatArray], FloatArray]
 
@@ -99,11 +100,12 @@ def imagine(
     # a regression may overshoot what was ever observed, and would be believed
     observed = outlook.rewards
     rewards = np.clip(observed.mean() + predicted[:, -1], observed.min(), observed.max())
-    p = settings.restart_probability
     expected = outlook.origin[rows] + predicted[:, :-1]
     problem = DualProblem(
         rewards=rewards - rewards.max(),
-        differences=(1.0 - p) * expected + p * outlook.start - outlook.features[rows],
+        differences=feature_differences(
+            outlook.features[rows], expected, outlook.restart, settings.restart_probability
+        ),
         kl_bound=settings.kl_bound,
         ridge=ridge / count,
         eta_floor=max(settings.eta_floor, ETA_LEAST),

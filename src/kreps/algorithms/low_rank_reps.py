@@ -36,6 +36,7 @@ from kreps.algorithms.reps import (
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
     embedding_hyperparameters,
+    restart_features,
     state_actions,
     state_kernel,
 )
@@ -114,6 +115,7 @@ def update(
     starts = reduce(add, compute.map(StartFeatures(basis, place), dataset.chunks))
     count = int(starts[-1])
     changes = FeatureChanges(basis, starts[:-1] / count, place)
+    own, after = replace(changes, place=as_float).both(sample)
     clock.lap("basis")
 
     # Eq. 4: the expected features of each successor, linear in features of state and action
@@ -122,7 +124,6 @@ def update(
     model, errors, embedding_start = None, None, None
     if settings.model != "sample":
         inputs = state_actions(sample, task)
-        own, after = replace(changes, place=as_float).both(sample)
         origin = own if from_own else np.zeros_like(own)
         successors = after - origin
         joint_kernel, regulariser, embedding_start = embedding_hyperparameters(
@@ -143,9 +144,11 @@ def update(
 
     # Eqs. 2 and 5: minimise the dual
     ridge = stationarity_ridge(settings, errors)
+    restart = restart_features(changes.start, own.mean(axis=0), settings)
+    rows = BellmanRows(changes, model, task, from_own, restart, settings.restart_probability)
     problem = StreamedProblem(
         dataset=dataset,
-        rows=BellmanRows(changes, model, task, from_own, settings.restart_probability),
+        rows=rows,
         rewards=rewards,
         kl_bound=settings.kl_bound,
         ridge=ridge / n,
@@ -183,7 +186,7 @@ def update(
             states=sample.states,
             features=own,
             origin=origin,
-            start=changes.start,
+            restart=restart,
             rewards=rewards[sampled],
             predict=of_sample.mean,
         )

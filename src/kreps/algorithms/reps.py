@@ -10,8 +10,10 @@ import numpy as np
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
+    feature_differences,
     fit_embedding,
     random_rows,
+    restart_features,
     state_kernel,
     successor_features,
 )
@@ -142,10 +144,12 @@ def update(
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
+    own = features[data.state]
+    restart = restart_features(features[data.start].mean(axis=0), own.mean(axis=0), settings)
     ridge = stationarity_ridge(settings, errors)
     problem = DualProblem(
         rewards=rewards,
-        differences=feature_differences(data, features, expected, settings.restart_probability),
+        differences=feature_differences(own, expected, restart, settings.restart_probability),
         kl_bound=settings.kl_bound,
         ridge=ridge / len(data),
         eta_floor=max(settings.eta_floor, ETA_LEAST),
@@ -164,9 +168,9 @@ def update(
     if settings.imagined and isinstance(model, KernelEmbedding):
         outlook = Outlook(
             states=data.states,
-            features=features[data.state],
+            features=own,
             origin=origin,
-            start=features[data.start].mean(axis=0),
+            restart=restart,
             rewards=rewards,
             predict=model.predictor(Outlook.targets(successors, rewards)),
         )
@@ -244,19 +248,6 @@ def transition_model(
     if settings.model == "sample":
         return SampleModel(), None
     return fit_embedding(data, successors, state_kernel, task, start, rng)
-
-
-def feature_differences(
-    data: Transitions, features: FloatArray, expected: FloatArray, restart_probability: float
-) -> FloatArray:
-    """``B = (1 - p) E[phi(s') | s_i, a_i] + p mean_k phi(s0_k) - phi(s_i)``, (n, r).
-
-    The process restarts with the known probability p, so that part of the dynamics needs no model.
-    """
-    start = features[data.start].mean(axis=0)
-    return (
-        (1.0 - restart_probability) * expected + restart_probability * start - features[data.state]
-    )
 
 
 def stationarity_ridge(settings: Settings, errors: LeaveOneOut | None) -> float:

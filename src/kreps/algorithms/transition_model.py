@@ -9,6 +9,7 @@ from kreps.data import TaskSpec, Transitions
 from kreps.embedding import KernelEmbedding
 from kreps.hyperparameters import EmbeddingLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel, SquaredExponential, median_lengthscales
+from kreps.settings import Settings
 
 FIT_SAMPLE = 400
 """Samples on which hyper-parameters are fitted: the cost is cubic, the estimate hardly better."""
@@ -37,6 +38,36 @@ def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
     successors = features[data.successor]
     successors[data.terminated] = features[data.start].mean(axis=0)
     return successors
+
+
+def restart_features(starts: FloatArray, states: FloatArray, settings: Settings) -> FloatArray:
+    """Mean features (r,) of the states that the process restarts in, as the update sees it.
+
+    Where it restarts decides which states an optimal policy visits, not what it does in them: a
+    restart with probability p is a discount 1 - p.  But the dual only settles V where its weights
+    are, and noise leads elsewhere; a share of exploring starts leaves no sampled state without.
+
+    Args:
+        starts, states: (r,) means over the start states and over all sampled states.
+        settings: ``exploring_starts``, the share of the latter.
+    """
+    share = settings.exploring_starts
+    return (1.0 - share) * starts + share * states
+
+
+def feature_differences(
+    own: FloatArray, expected: FloatArray, restart: FloatArray, restart_probability: float
+) -> FloatArray:
+    """``B = (1 - p) E[phi(s') | s_i, a_i] + p phi_restart - phi(s_i)``, (n, r).
+
+    The process restarts with the known probability p, so that part of the dynamics needs no model.
+
+    Args:
+        own, expected: (n, r) features of each state, and what they are expected to become.
+        restart: (r,) of `restart_features`.
+        restart_probability: p.
+    """
+    return (1.0 - restart_probability) * expected + restart_probability * restart - own
 
 
 def state_actions(data: Transitions, task: TaskSpec) -> FloatArray:
