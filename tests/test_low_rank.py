@@ -135,6 +135,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "grid": {"features": "grid", "grid_size": 6},
     "grid of the sample": {"features": "grid", "grid_size": 6, "model": "sample"},
     "paper": {"recipe": "paper", "eta_floor": 0.0},
+    "exploring starts": {"exploring_starts": 0.5},
 }
 
 

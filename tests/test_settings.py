@@ -17,7 +17,7 @@ def test_the_default_recipe_is_the_defaults() -> None:
 def test_the_observed_recipe_is_one_step_with_the_numbers_of_old() -> None:
     observed = settings_of("observed")
     assert (observed.kl_bound, observed.eta_floor, observed.ridge) == (1.0, 0.1, 0.1)
-    assert observed.imagined == 0
+    assert (observed.imagined, observed.exploring_starts) == (0, 0.0)
     assert (observed.model, observed.features, observed.policy_fit) == ("change", "rkhs", "map")
 
 
@@ -25,7 +25,8 @@ def test_the_default_recipe_asks_the_model_for_more_than_the_observed_one() -> N
     default = settings_of()
     assert default.ridge is None
     assert default.imagined > 0
-    own = {"ridge": 0.1, "imagined": 0, "eta_floor": 0.1}
+    assert 0.0 < default.exploring_starts < 1.0
+    own = {"ridge": 0.1, "imagined": 0, "eta_floor": 0.1, "exploring_starts": 0.0}
     assert settings_of("default", **own) == settings_of("observed")
 
 
@@ -48,7 +49,7 @@ def test_the_paper_recipe_has_a_low_floor_and_hard_ranges() -> None:
     assert (paper.eta_floor, paper.policy_fit) == (0.02, "bounded")
     assert 0.0 < paper.kl_bound < 1.0  # the paper leaves it open
     assert paper.model == "embedding"
-    assert (paper.ridge, paper.imagined) == (0.1, 0)
+    assert (paper.ridge, paper.imagined, paper.exploring_starts) == (0.1, 0, 0.0)
     assert (paper.initial_rollouts, paper.rollouts_per_iteration, paper.window) == (30, 10, 30)
     assert paper.restart_probability == 0.02
 
@@ -84,6 +85,7 @@ def test_an_unknown_parameter_is_refused_with_the_choices() -> None:
         ],
         *[("ridge", value) for value in (0.0, -1.0, float("inf"), float("nan"), "1", True)],
         *[("imagined", value) for value in (-1, 2.5, 4.0, "4", True, None)],
+        *[("exploring_starts", value) for value in (-0.1, 1.1, float("nan"), "1", True, None)],
         *[("eta_floor", value) for value in (-1e-9, float("inf"), float("nan"), "0", False)],
         *[("restart_probability", value) for value in (0.0, 1.0, -0.1, 1.5, float("nan"), "0.1")],
         *[
@@ -115,6 +117,8 @@ def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
         ("ridge", None),
         ("ridge", 1e-9),
         ("imagined", 0),
+        ("exploring_starts", 0.0),
+        ("exploring_starts", 1.0),
         ("imagined", 1),
         ("model", "embedding"),
         ("features", "grid"),

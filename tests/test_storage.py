@@ -916,15 +916,15 @@ def test_forged_checkpoints_are_refused(
 
 
 @pytest.mark.parametrize("changes", [{}, {"model": "sample", "ridge": 0.1}])
-def test_checkpoints_of_before_the_imagined_step_keep_their_meaning(
+def test_checkpoints_of_before_a_setting_was_there_keep_their_meaning(
     changes: dict[str, Any], files: dict[str, Good], tmp_path: Path
 ) -> None:
     file = files["reps checkpoint"]
     settings = {**file.header["settings"], **changes}
-    del settings["imagined"]
+    del settings["imagined"], settings["exploring_starts"]
     path = forge(tmp_path / "old", file.tensors, {**file.header, "settings": settings})
     learner = kreps.KREPS.resume(path, gym.make("kreps/SwingUp-v0"))
-    assert learner.settings.imagined == 0
+    assert (learner.settings.imagined, learner.settings.exploring_starts) == (0, 0.0)
     assert {k: v for k, v in vars(learner.settings).items() if k in settings} == settings
     learner.learn(1, progress=False)
     assert learner.state.iteration == file.header["iteration"] + 1
