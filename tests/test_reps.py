@@ -526,7 +526,7 @@ def test_a_share_of_the_restarts_is_in_the_sampled_states() -> None:
         np.testing.assert_array_equal(found, wanted)
 
 
-def test_exploring_starts_settle_what_to_do_beside_the_way() -> None:
+def test_exploring_starts_give_weight_to_the_best_action_beside_the_way() -> None:
     """Two states: to stay in the first pays, and only from there may the second be reached."""
     eye = np.eye(2)
     state, after = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])

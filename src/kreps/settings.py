@@ -98,8 +98,9 @@ class Settings(OnPolicySettings):
         ridge: rho times the number of samples; the softness of the stationarity constraint.  None
             takes the mean squared leave-one-out error of the transition model: stationarity is
             asked for as strictly as successors can be predicted.
-        exploring_starts: share of the restarts that an update places in any of the sampled states
-            instead of the start states, so that V and the policy are right beside the way, too.
+        exploring_starts: share of the random restarts that an update plans with in any of the
+            sampled states instead of the start states, so that V is learnt beside the way, too;
+            roll-outs begin where the environment begins them.
         imagined: actions per state that are drawn anew for a second bounded step, in which the
             model says what they lead to; 0 leaves that step out.
         model: transition model: ``"change"`` embeds how the features change, so that far from the

@@ -43,12 +43,13 @@ def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
 def restart_features(starts: FloatArray, states: FloatArray, settings: Settings) -> FloatArray:
     """Mean features (r,) of the states that the process restarts in, as the update sees it.
 
-    Where it restarts decides which states an optimal policy visits, not what it does in them: a
-    restart with probability p is a discount 1 - p.  But the dual only settles V where its weights
-    are, and noise leads elsewhere; a share of exploring starts leaves no sampled state without.
+    A restart with probability p is a discount 1 - p, and under a discount there is a policy that
+    is best from every state at once: other restarts leave it optimal.  But the dual hardly settles
+    V where its weights are not, and noise leads there; exploring starts spread the weights.
 
     Args:
-        starts, states: (r,) means over the start states and over all sampled states.
+        starts, states: (r,) means over the start states and over the sampled states (in low rank:
+            over those of the sample).
         settings: ``exploring_starts``, the share of the latter.
     """
     share = settings.exploring_starts
