@@ -375,7 +375,8 @@ show(figure, "3_embedding")
 #
 # `gamma E[phi(s') | s_i, a_i] + (1 - gamma) mean phi(s0) - phi(s_i)`
 #
-# with the start states `s0` ([`feature_differences`](../src/kreps/algorithms/transition_model.py)). `B` is
+# with the start states `s0`
+# ([`feature_differences`](../src/kreps/algorithms/transition_model.py)). `B` is
 # only an estimate, so a small number `rho` makes the constraint soft.
 #
 # The constraints have multipliers: a temperature `eta > 0` for the bound, a vector `theta` for
