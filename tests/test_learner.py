@@ -477,13 +477,14 @@ def test_evaluation_agrees_with_the_riccati_equation() -> None:
         assert earned(task, LinearFeedback(factor * gain)) < 1.05 * best
 
 
-@pytest.mark.parametrize(("recipe", "worst"), [("default", 2.0), ("observed", 1.5)])
+@pytest.mark.parametrize(("recipe", "updates"), [("default", 10), ("observed", 6)])
 def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem(
-    recipe: str, worst: float
+    recipe: str, updates: int
 ) -> None:
     # Measured over seeds 0 to 7: with the recipe "observed" the cost is 1.02 to 1.10 of the optimum
-    # for seven, 1.32 for one; with the default 1.02 to 1.14 for five, 1.28, 1.55 and 1.82.  The
-    # first policy costs 54 times the optimum, doing nothing 4.6 times.
+    # for seven, 1.32 for one.  The default is not as steady: 1.01 to 1.21 for seven and 3.5 for one
+    # after six updates, 1.03 to 1.20 for all after ten.  The first policy costs 54 times the
+    # optimum, doing nothing 4.6 times.
     _, best = optimum()
     shares = []
     for seed in range(5):
@@ -497,12 +498,12 @@ def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem(
             rollouts_per_iteration=20,
             window=40,
         )
-        learner.learn(6, progress=False)
+        learner.learn(updates, progress=False)
         assert learner.state.policy is not None
         shares.append(earned(learner.task, Greedy(learner.state.policy)) / best)
     first = earned(TaskSpec(2, [-4.0], [4.0]), Gaussian(TaskSpec(2, [-4.0], [4.0]), 1.0)) / best
     assert sorted(shares)[3] < 1.15  # at least four of five within 15 %
-    assert max(shares) < worst
+    assert max(shares) < 1.5
     assert first > 10 * max(shares)
 
 
