@@ -1,4 +1,7 @@
-"""The conditional embedding fitted to a window of transitions, as several methods need it."""
+"""The conditional embedding fitted to a window of transitions, as several methods need it.
+
+And what every step of REPS makes of it: the differences of features, restarts included.
+"""
 
 from __future__ import annotations
 
