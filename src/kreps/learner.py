@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
@@ -16,6 +16,7 @@ import numpy as np
 
 from kreps import storage
 from kreps.algorithms import low_rank_reps, npalp, reps, value_iteration
+from kreps.algorithms.rare_states import rewarded_by_rarity
 from kreps.algorithms.state import LearnerState, UpdateReport
 from kreps.arrays import FloatArray
 from kreps.compute import Compute
@@ -305,13 +306,15 @@ class OnPolicyLearner(Learner[OnPolicy]):
     """A learner that explores by its own stochastic policy, from start states only (Sec. 4.1)."""
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
-        first = self.state.iteration == 0
         settings = self.settings
+        count = settings.rollouts_per_iteration
+        if self.state.iteration == 0 and settings.exploration != "seeking":
+            count = settings.initial_rollouts
         return collect(
             env,
             self.task,
             self._acting_policy(),
-            settings.initial_rollouts if first else settings.rollouts_per_iteration,
+            count,
             seed=self.seed,
             iteration=self.state.iteration,
             restart_probability=settings.restart_probability,
@@ -394,12 +397,24 @@ class KREPS(OnPolicyLearner[Settings]):
     def _updated(
         self, rollouts: list[Rollout], rng: np.random.Generator
     ) -> tuple[LearnerState, UpdateReport]:
-        samples = sum(map(len, self.state.window.extend(rollouts).rollouts))
+        seen = self.state.rollouts + len(rollouts)
+        if self.settings.exploration != "seeking" or seen >= self.settings.initial_rollouts:
+            return self._learnt(self.state, rollouts, rng)
+        # an update in its own right, of which the roll-outs are kept as they were
+        window = self.state.extended_window(rollouts, self.task)
+        told = rewarded_by_rarity(window, self.task, rng)
+        blank = replace(self.state, window=Window(window.capacity))
+        learnt, info = self._learnt(blank, told, rng)
+        after = self.state.after(rollouts, window)
+        return replace(learnt, window=window, rollouts=after.rollouts, steps=after.steps), info
+
+    def _learnt(
+        self, state: LearnerState, rollouts: list[Rollout], rng: np.random.Generator
+    ) -> tuple[LearnerState, UpdateReport]:
+        samples = sum(map(len, state.window.extend(rollouts).rollouts))
         if not low_rank_reps.applies(self.settings, samples):
-            return super()._updated(rollouts, rng)
-        return low_rank_reps.update(
-            self.state, rollouts, self.task, self.settings, rng, self.compute
-        )
+            return type(self).algorithm(state, rollouts, self.task, self.settings, rng)
+        return low_rank_reps.update(state, rollouts, self.task, self.settings, rng, self.compute)
 
     @property
     def value_function(self) -> LinearFunction:

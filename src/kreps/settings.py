@@ -14,7 +14,8 @@ Model = Literal["change", "embedding", "sample"]
 Approximation = Literal["auto", "exact", "pivoted", "uniform", "fourier"]
 Features = Literal["rkhs", "grid"]
 PolicyFit = Literal["map", "bounded"]
-Exploration = Literal["bang-bang", "gaussian"]
+Noise = Literal["bang-bang", "gaussian"]
+Exploration = Literal[Noise, "seeking"]
 
 
 @dataclass(frozen=True)
@@ -66,11 +67,16 @@ class OnPolicySettings(LearnerSettings):
     A roll-out lasts (1 - p) / p steps on expectation.  Beside `LearnerSettings`:
 
     Attributes:
-        exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``.
+        exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``;
+            KREPS also knows ``"seeking"``: a Gaussian one for the first ``rollouts_per_iteration``
+            of the initial roll-outs, then updates that seek rare states instead of reward.
         exploration_scale: standard deviation of the Gaussian one, in units of half the range.
-        initial_rollouts: roll-outs of the first policy.
+        initial_rollouts: roll-outs before the reward is learnt from.
         rollouts_per_iteration: roll-outs of the current policy before each later update.
     """
+
+    explorations: ClassVar[Any] = Noise
+    """What ``exploration`` may be."""
 
     exploration: Exploration = "bang-bang"
     exploration_scale: float = 1.0
@@ -79,7 +85,7 @@ class OnPolicySettings(LearnerSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._choose("exploration", Exploration)
+        self._choose("exploration", self.explorations)
         self._positive("exploration_scale")
         self._whole("initial_rollouts", "rollouts_per_iteration")
 
@@ -119,6 +125,8 @@ class Settings(OnPolicySettings):
         rank: most features of states and actions and most centres of the policy where they are
             approximated; V has ``max_rank``.
     """
+
+    explorations: ClassVar[Any] = Exploration
 
     kl_bound: float = 1.0
     eta_floor: float = 0.05
