@@ -358,7 +358,7 @@ def _draw_seeds(axes: Axes, rows: Sequence[Mapping[str, Any]], name: str) -> Non
         axes.fill_between(
             steps, mean - band, mean + band, color=ORANGE, alpha=0.25, lw=0, label="± 2 s.e."
         )
-    axes.legend(loc="lower right")
+    axes.legend(loc="lower right", frameon=True, framealpha=1.0, edgecolor="none")  # above lines
 
 
 COLOURS = ("#20639b", "#d1603d", "#c29b19", "#8e5ea2", "#5b6068", "#3caea3")
