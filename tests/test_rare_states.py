@@ -35,6 +35,11 @@ def test_a_point_far_from_all_others_is_the_rarest() -> None:
     assert np.argmax(rarity(points)) == 17
 
 
+def test_of_a_few_points_the_farthest_other_one_counts() -> None:
+    found = rarity(np.array([[0.0], [1.0], [3.0]]))
+    np.testing.assert_allclose(found, np.log(np.array([3.0, 2.0, 3.0]) + 1e-3))
+
+
 @pytest.mark.parametrize("count", [2, 3, NEIGHBOURS, NEIGHBOURS + 1])
 def test_few_points_and_equal_ones_are_finite(count: int) -> None:
     found = rarity(np.ones((count, 2)))
@@ -73,10 +78,12 @@ def test_an_angle_is_near_itself_after_a_turn() -> None:
 
 @pytest.mark.parametrize("approximation", ["exact", "pivoted"])
 def test_roll_outs_are_kept_with_their_rewards_and_counted_once(approximation: str) -> None:
-    learner = seeker(approximation=approximation)
-    learner.learn(1, progress=False)
+    learner = seeker(approximation=approximation, initial_rollouts=9)
+    counts = []
+    learner.learn(2, callback=lambda _, r: counts.append(r.rollouts), progress=False)
     state = learner.state
-    assert (state.iteration, state.rollouts) == (1, 3)  # not all six at once
+    assert counts == [3, 6]  # not all nine at once
+    assert (state.iteration, state.rollouts, len(state.window.rollouts)) == (2, 6, 6)
     assert state.steps == sum(len(r) for r in state.window.rollouts)
     for rollout in state.window.rollouts:
         theta, velocity = rollout.observations[:-1].T
@@ -95,6 +102,33 @@ def test_the_reward_is_learnt_from_once_the_initial_roll_outs_are_there() -> Non
     one, two = first.update(batch), plain.update(batch)
     assert first.state.rollouts == 6
     np.testing.assert_array_equal(one.dual.theta, two.dual.theta)
+
+
+def test_the_share_of_clipped_actions_is_of_the_new_roll_outs() -> None:
+    rng = np.random.default_rng(4)
+
+    def rollout(scale: float) -> Rollout:
+        return Rollout(rng.standard_normal((9, 2)), np.full((8, 1), scale), np.zeros(8))
+
+    learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]), exploration="seeking", **TINY)
+    assert learner.update([rollout(0.5)]).clipped == 0.0
+    assert learner.update([rollout(2.0)]).clipped == 1.0
+
+
+def test_a_batch_larger_than_the_window_is_counted_whole() -> None:
+    rng = np.random.default_rng(5)
+    batch = [Rollout(rng.standard_normal((9, 2)), np.zeros((8, 1)), np.zeros(8)) for _ in "abc"]
+    task = TaskSpec(2, [-1.0], [1.0])
+    learner = kreps.KREPS(task, exploration="seeking", **(TINY | {"window": 2}))
+    info = learner.update(batch)
+    assert info.samples == 16
+    assert (learner.state.rollouts, learner.state.steps) == (3, 24)
+    assert learner.state.window.rollouts == tuple(batch[1:])
+
+
+def test_seeking_that_could_never_happen_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match=r"rollouts_per_iteration = 6,.*more of them"):
+        seeker(rollouts_per_iteration=6)
 
 
 def test_before_that_it_is_not() -> None:

@@ -288,9 +288,8 @@ def local_optimum(
         reward,
         value,
         f"The reward, {reward:.4g}, is near {name} ({value:g}): the run is probably stuck there.",
-        "a new run, as going on from a stuck policy seldom helps: another --seed, first roll-outs "
-        "that seek rare states (--set exploration=seeking), or more of them "
-        "(--set initial_rollouts=60).",
+        "a new run, as going on from a stuck policy seldom helps: another --seed, more roll-outs "
+        "at first (--set initial_rollouts=60), or smaller steps (--set kl_bound=0.5).",
     )
 
 

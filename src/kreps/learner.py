@@ -307,19 +307,21 @@ class OnPolicyLearner(Learner[OnPolicy]):
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
         settings = self.settings
-        count = settings.rollouts_per_iteration
-        if self.state.iteration == 0 and settings.exploration != "seeking":
-            count = settings.initial_rollouts
         return collect(
             env,
             self.task,
             self._acting_policy(),
-            count,
+            self._batch(),
             seed=self.seed,
             iteration=self.state.iteration,
             restart_probability=settings.restart_probability,
             on_rollout=on_rollout,
         )
+
+    def _batch(self) -> int:
+        """Roll-outs of the next iteration."""
+        first = self.state.iteration == 0
+        return self.settings.initial_rollouts if first else self.settings.rollouts_per_iteration
 
     def _acting_policy(self) -> StochasticPolicy:
         if self.state.policy is not None:
@@ -394,17 +396,25 @@ class KREPS(OnPolicyLearner[Settings]):
             )
         return info
 
+    @property
+    def _seeks(self) -> bool:
+        return self.settings.exploration == "seeking"
+
+    def _batch(self) -> int:
+        return self.settings.rollouts_per_iteration if self._seeks else super()._batch()
+
     def _updated(
         self, rollouts: list[Rollout], rng: np.random.Generator
     ) -> tuple[LearnerState, UpdateReport]:
         seen = self.state.rollouts + len(rollouts)
-        if self.settings.exploration != "seeking" or seen >= self.settings.initial_rollouts:
+        if not self._seeks or seen >= self.settings.initial_rollouts:
             return self._learnt(self.state, rollouts, rng)
-        # an update in its own right, of which the roll-outs are kept as they were
+        # an update like any other, but the roll-outs are kept with the rewards that they have
         window = self.state.extended_window(rollouts, self.task)
         told = rewarded_by_rarity(window, self.task, rng)
-        blank = replace(self.state, window=Window(window.capacity))
-        learnt, info = self._learnt(blank, told, rng)
+        old, new = told[: -len(rollouts)], told[-len(rollouts) :]
+        before = replace(self.state, window=Window(window.capacity, tuple(old)))
+        learnt, info = self._learnt(before, new, rng)
         after = self.state.after(rollouts, window)
         return replace(learnt, window=window, rollouts=after.rollouts, steps=after.steps), info
 
@@ -418,7 +428,7 @@ class KREPS(OnPolicyLearner[Settings]):
 
     @property
     def value_function(self) -> LinearFunction:
-        """V of the last update (Eq. 3), in units of the reward.
+        """V of the last update (Eq. 3), in units of the reward (of rarity while it is sought).
 
         Raises:
             ConfigurationError: nothing has been learnt yet.

@@ -69,14 +69,15 @@ class OnPolicySettings(LearnerSettings):
     Attributes:
         exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``;
             KREPS also knows ``"seeking"``: a Gaussian one for the first ``rollouts_per_iteration``
-            of the initial roll-outs, then updates that seek rare states instead of reward.
+            of the initial roll-outs, then updates that seek rare states instead of reward.  Until
+            there are ``initial_rollouts``, policy and V know nothing of the reward.
         exploration_scale: standard deviation of the Gaussian one, in units of half the range.
         initial_rollouts: roll-outs before the reward is learnt from.
         rollouts_per_iteration: roll-outs of the current policy before each later update.
     """
 
     explorations: ClassVar[Any] = Noise
-    """What ``exploration`` may be."""
+    """The choices of ``exploration``."""
 
     exploration: Exploration = "bang-bang"
     exploration_scale: float = 1.0
@@ -155,6 +156,13 @@ class Settings(OnPolicySettings):
         self._check("exploring_starts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
         self._check("imagined", Integral, "a whole number >= 0", lambda v: v >= 0)
         self._whole("max_rank", "grid_size", "rank")
+        if self.exploration == "seeking" and self.rollouts_per_iteration >= self.initial_rollouts:
+            raise ConfigurationError(
+                f'exploration = "seeking" with initial_rollouts = {self.initial_rollouts} and '
+                f"rollouts_per_iteration = {self.rollouts_per_iteration}, but it seeks "
+                "after the first batch and before there are all initial roll-outs; "
+                'ask for more of them, for smaller batches or for exploration="gaussian"'
+            )
         if self.model == "sample" and (self.imagined or self.ridge is None):
             raise ConfigurationError(
                 f'model = "sample" with imagined = {self.imagined} and ridge = {self.ridge}, but '
