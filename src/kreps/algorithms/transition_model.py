@@ -15,7 +15,7 @@ from kreps.kernels import Kernel, SquaredExponential, median_lengthscales
 from kreps.settings import Settings
 
 FIT_SAMPLE = 400
-"""Samples on which hyper-parameters are fitted: the cost is cubic, the estimate hardly better."""
+"""Samples on which hyper-parameters are fitted: the cost is cubic, the estimate no better."""
 
 
 def random_rows(n: int, rng: np.random.Generator) -> IntArray:
