@@ -22,7 +22,7 @@ from kreps.experiments.executors import executor
 from kreps.experiments.figures import draw_features, write_figure
 from kreps.experiments.runner import figure_cells, run_cells
 from kreps.experiments.search import CANDIDATES, search_cells, write_search
-from kreps.experiments.specs import BEYOND, FIGURES, PICTURES
+from kreps.experiments.specs import BEYOND, FIGURES, FIRST_SEED, PICTURES
 from kreps.learner import KREPS
 from kreps.report import (
     draw_diagnosis,
@@ -311,7 +311,11 @@ def reproduce(
         ),
     ],
     trials: Annotated[
-        int, typer.Option(min=1, help="Seeds: from 0, or from 500 where fresh ones confirm.")
+        int,
+        typer.Option(
+            min=1,
+            help=f"Seeds: from 0, or from {max(FIRST_SEED.values())} where fresh ones confirm.",
+        ),
     ] = 10,
     workers: WorkersOption = 2,
     iterations: Annotated[
