@@ -15,11 +15,9 @@ from kreps.algorithms import imagined_step, low_rank_reps, reps, transition_mode
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine, resample
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
-    IMAGINED_FIT_SAMPLE,
     RIDGE_LEAST,
     PolicySamples,
     UpdateInfo,
-    policy_hyperparameters,
     share_clipped,
     stationarity_ridge,
     value_basis,
@@ -27,7 +25,6 @@ from kreps.algorithms.reps import (
 from kreps.algorithms.transition_model import (
     feature_differences,
     fit_embedding,
-    random_rows,
     restart_features,
     state_actions,
     state_kernel,
@@ -380,38 +377,7 @@ def test_of_one_action_in_each_state_nothing_is_lost() -> None:
         data, ImaginedSamples(np.arange(n), data.actions, nothing), p, TASK
     )
     for name, value in vars(wanted).items():
-        if name != "fit_sample":  # fewer of them: neighbours share the errors of V
-            np.testing.assert_allclose(getattr(found, name), value, atol=1e-14)
-    assert found.fit_sample == IMAGINED_FIT_SAMPLE < wanted.fit_sample
-
-
-@pytest.mark.parametrize("fit_sample", [30, 60])
-def test_hyper_parameters_hear_no_more_samples_than_asked_for(fit_sample: int) -> None:
-    """Targets that are noise in rows which are not drawn leave the fit as it was."""
-    rng = np.random.default_rng(14)
-    states = rng.standard_normal((60, 1))
-    targets = np.sin(2.0 * states)
-    kernel = Kernel((SquaredExponential((0,)),), np.array([1.0]))
-    drawn = random_rows(60, fit_sample, np.random.default_rng(15))
-    other = np.setdiff1d(np.arange(60), drawn)
-    shuffled = targets.copy()
-    shuffled[other] = rng.permutation(targets[other])  # the mean and the spread are as before
-    found = [
-        policy_hyperparameters(
-            PolicySamples(states, u, np.ones(60), 60.0, np.zeros(60), fit_sample),
-            kernel,
-            Settings(),
-            None,
-            np.random.default_rng(15),
-        )
-        for u in (targets, shuffled)
-    ]
-    assert len(drawn) == fit_sample
-    np.testing.assert_allclose(*found, rtol=1e-6)
-    if fit_sample < 60:
-        everything = PolicySamples(states, shuffled, np.ones(60), 60.0, np.zeros(60))
-        whole = policy_hyperparameters(everything, kernel, Settings(), None, rng)
-        assert np.abs(whole - found[0]).max() > 0.1  # what is not heard would be noise
+        np.testing.assert_allclose(getattr(found, name), value, atol=1e-14)
 
 
 def test_the_spread_of_what_is_imagined_in_a_state_stays_in_the_policy() -> None:

@@ -477,14 +477,14 @@ def test_evaluation_agrees_with_the_riccati_equation() -> None:
         assert earned(task, LinearFeedback(factor * gain)) < 1.05 * best
 
 
-@pytest.mark.parametrize(("recipe", "updates"), [("default", 12), ("observed", 6)])
+@pytest.mark.parametrize(("recipe", "updates"), [("default", 10), ("observed", 6)])
 def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem(
     recipe: str, updates: int
 ) -> None:
     # Measured over seeds 0 to 7: with the recipe "observed" the cost is 1.02 to 1.10 of the optimum
-    # for seven, 1.32 for one.  The default is slower: over seeds 0 to 9 it is 1.02 to 1.28 for nine
-    # and 1.98 for one after six updates, 1.01 to 1.23 after ten, 1.01 to 1.12 after twelve.  The
-    # first policy costs 54 times the optimum, doing nothing 4.6 times.
+    # for seven, 1.32 for one.  The default is not as steady: 1.01 to 1.21 for seven and 3.5 for one
+    # after six updates, 1.03 to 1.20 for all after ten.  The first policy costs 54 times the
+    # optimum, doing nothing 4.6 times.
     _, best = optimum()
     shares = []
     for seed in range(5):

@@ -10,7 +10,6 @@ import numpy as np
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
-    FIT_SAMPLE,
     feature_differences,
     fit_embedding,
     random_rows,
@@ -38,13 +37,6 @@ from kreps.value import Basis, RBFGrid, RKHSBasis
 
 DROPPED_WEIGHT = 0.05
 """Samples with ``n p_i`` below this do not enter the policy: they say next to nothing."""
-
-IMAGINED_FIT_SAMPLE = 200
-"""Imagined targets on which the policy's hyper-parameters are fitted.
-
-Neighbours share the errors of V and of the model, which leave-one-out takes for structure: of more
-samples, neighbours are nearer, and late policies now and then are much worse than the one before.
-"""
 
 RIDGE_LEAST = 1e-6
 """Least ridge where the model asks for none: it keeps V finite in directions that no state has."""
@@ -281,7 +273,6 @@ class PolicySamples:
         weights: (m,) ``p_i / sum p^2``: over all samples they add up to the effective sample size.
         evidence: sum of the weights of all samples kept, whether or not they are among these.
         within: (m,) variance of what each target is the mean of, summed over its coordinates.
-        fit_sample: how many of them hyper-parameters are fitted to, at most.
     """
 
     states: FloatArray
@@ -289,7 +280,6 @@ class PolicySamples:
     weights: FloatArray
     evidence: float
     within: FloatArray
-    fit_sample: int = FIT_SAMPLE
 
     @classmethod
     def of(cls, data: Transitions, p: FloatArray, task: TaskSpec) -> PolicySamples:
@@ -319,8 +309,7 @@ class PolicySamples:
         np.add.at(targets, group, (each / weights[group])[:, None] * actions)
         squares = np.sum((actions - targets[group]) ** 2, axis=1)
         np.add.at(within, group, each / weights[group] * squares)
-        evidence = float(weights.sum())
-        return cls(data.states[rows], targets, weights, evidence, within, IMAGINED_FIT_SAMPLE)
+        return cls(data.states[rows], targets, weights, float(weights.sum()), within)
 
 
 def policy_hyperparameters(
@@ -362,7 +351,7 @@ def policy_hyperparameters(
             high=np.concatenate([median, np.log([3.0, 4.0])]),
             strength=0.0,
         )
-    rows = random_rows(len(share), samples.fit_sample, rng)
+    rows = random_rows(len(share), rng)
     loss = PolicyLoss(
         factor_distances(state_kernel.factors, samples.states[rows]),
         samples.targets[rows],

@@ -18,11 +18,11 @@ FIT_SAMPLE = 400
 """Samples on which hyper-parameters are fitted: the cost is cubic, the estimate no better."""
 
 
-def random_rows(n: int, most: int, rng: np.random.Generator) -> IntArray:
-    """At most ``most`` row numbers out of n, in order."""
-    if n <= most:
+def random_rows(n: int, rng: np.random.Generator) -> IntArray:
+    """At most `FIT_SAMPLE` row numbers out of n, in order."""
+    if n <= FIT_SAMPLE:
         return np.arange(n)
-    return np.sort(rng.choice(n, most, replace=False))
+    return np.sort(rng.choice(n, FIT_SAMPLE, replace=False))
 
 
 def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) -> Kernel:
@@ -101,7 +101,7 @@ def embedding_hyperparameters(
         SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
     )
     factors = (*state_kernel.factors, *action_factors)
-    sample = random_rows(len(inputs), FIT_SAMPLE, rng)
+    sample = random_rows(len(inputs), rng)
     median = np.log(median_lengthscales(factors, inputs, rng))
     prior = Prior(
         centre=np.append(median, 0.0),
