@@ -129,6 +129,7 @@ def content(learner: kreps.KREPS, path: Path) -> bytes:
 # ---- at full rank -----------------------------------------------------------------------------
 
 VARIANTS: dict[str, dict[str, Any]] = {
+    "dynamics": {"model": "dynamics"},
     "change": {},
     "embedding": {"model": "embedding"},
     "sample": {"model": "sample"},
@@ -160,7 +161,7 @@ def test_it_learns_commands_beyond_the_limits_as_they_were_given(rollouts: list[
     assert_close(found, exact, visited(rollouts), weights=1e-6, policy=1e-5)
 
 
-@pytest.mark.parametrize("model", ["change", "embedding", "sample"])
+@pytest.mark.parametrize("model", ["dynamics", "change", "embedding", "sample"])
 def test_steps_that_really_end_are_followed_by_the_mean_start(
     model: str, rollouts: list[Rollout], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -26,7 +26,13 @@ def test_the_default_recipe_asks_the_model_for_more_than_the_observed_one() -> N
     assert default.ridge is None
     assert default.imagined > 0
     assert 0.0 < default.exploring_starts < 1.0
-    own = {"ridge": 0.1, "imagined": 0, "eta_floor": 0.1, "exploring_starts": 0.0}
+    own = {
+        "ridge": 0.1,
+        "imagined": 0,
+        "eta_floor": 0.1,
+        "exploring_starts": 0.0,
+        "model": "change",
+    }
     assert settings_of("default", **own) == settings_of("observed")
 
 

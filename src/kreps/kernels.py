@@ -23,6 +23,11 @@ from kreps.linalg import PivotedCholesky, pivoted_cholesky, principal_coordinate
 class Factor(Protocol):
     """One factor of a product kernel, with one lengthscale."""
 
+    @property
+    def dims(self) -> tuple[int, ...]:
+        """The columns of the input that it is over."""
+        ...
+
     def coordinates(self, x: Array) -> Array:
         """Euclidean coordinates (n, m) of inputs (n, d) at lengthscale one."""
         ...

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, Literal, TypeVar, get_args
 
 from kreps.errors import ConfigurationError
 
-Model = Literal["change", "embedding", "sample"]
+Model = Literal["dynamics", "change", "embedding", "sample"]
 Approximation = Literal["auto", "exact", "pivoted", "uniform", "fourier"]
 Features = Literal["rkhs", "grid"]
 PolicyFit = Literal["map", "bounded"]
@@ -110,9 +110,10 @@ class Settings(OnPolicySettings):
             roll-outs begin where the environment begins them.
         imagined: actions per state that are drawn anew for a second bounded step, in which the
             model says what they lead to; 0 leaves that step out.
-        model: transition model: ``"change"`` embeds how the features change, so that far from the
-            data the state stays; ``"embedding"`` embeds the successor itself, as printed (Eq. 4);
-            ``"sample"`` takes the observed successor.
+        model: transition model: ``"dynamics"`` regresses how the state changes, and takes the
+            features of V where that leads; ``"change"`` embeds how the features change, so that
+            far from the data the state stays; ``"embedding"`` embeds the successor itself, as
+            printed (Eq. 4); ``"sample"`` takes the observed successor.
         features: of V, ``"rkhs"`` (Eq. 3) or ``"grid"`` (fixed radial basis functions).
         grid_size: centres per coordinate of the grid.
         policy_fit: hyper-parameters of the policy by leave-one-out density, ``"map"`` with priors
@@ -134,7 +135,7 @@ class Settings(OnPolicySettings):
     ridge: float | None = None
     exploring_starts: float = 0.25
     imagined: int = 4
-    model: Model = "change"
+    model: Model = "dynamics"
     features: Features = "rkhs"
     grid_size: int = 10
     policy_fit: PolicyFit = "map"
@@ -256,7 +257,7 @@ class NPALPSettings(OnPolicySettings):
 
 AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
 
-OBSERVED = Settings(eta_floor=0.1, ridge=0.1, exploring_starts=0.0, imagined=0)
+OBSERVED = Settings(eta_floor=0.1, ridge=0.1, exploring_starts=0.0, imagined=0, model="change")
 
 RECIPES: dict[str, Settings] = {
     "default": Settings(),

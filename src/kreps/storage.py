@@ -69,6 +69,7 @@ CHECKPOINT_ARRAYS = (
         "value.theta",
         "start.policy",
         "start.embedding",
+        "start.reward",
     }
 )
 ADDED_LATER: dict[str, dict[str, Any]] = {"reps": {"imagined": 0, "exploring_starts": 0.0}}
@@ -647,6 +648,8 @@ def save_checkpoint(
         tensors |= _value_parts(state.value)
     if state.embedding_start is not None:
         tensors["start.embedding"] = state.embedding_start
+    if state.reward_start is not None:
+        tensors["start.reward"] = state.reward_start
     if state.policy_start is not None:
         tensors["start.policy"] = state.policy_start
     write_arrays(Path(path), "checkpoint", tensors, header)
@@ -689,6 +692,7 @@ def load_checkpoint(
             policy=_policy_of(tensors, task, header["policy"]) if learnt else None,
             value=_value_of(tensors, task) if learnt and method == "reps" else None,
             embedding_start=_start_of(tensors, "start.embedding", g + task.action_size + 1),
+            reward_start=_start_of(tensors, "start.reward", g + task.action_size + 1),
             policy_start=_start_of(tensors, "start.policy", g + 2),
         )
     except (KrepsError, KeyError, TypeError, ValueError, OverflowError) as error:

@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 
+from kreps.algorithms.dynamics import Motion, state_changes
 from kreps.algorithms.transition_model import state_actions
 from kreps.arrays import Array, FloatArray, as_numpy, like, rows
 from kreps.compute import Compute
@@ -83,10 +84,12 @@ class FeatureChanges:
     def both(self, data: Transitions) -> tuple[Array, Array]:
         """``phi(s_i)`` and the observed ``phi(s'_i)``, (n, r) each."""
         points = self.basis.features(self.place(data.points))
-        after = rows(points, data.successor)
+        return rows(points, data.state), self.ended(data, rows(points, data.successor))
+
+    def ended(self, data: Transitions, after: Array) -> Array:
+        """Features (n, r) of successors with those of the start states after a real end."""
         ended = like(data.terminated[:, None].astype(np.float64), after)
-        after = after + ended * (like(self.start, after) - after)
-        return rows(points, data.state), after
+        return after + ended * (like(self.start, after) - after)
 
 
 @dataclass(frozen=True)
@@ -113,34 +116,100 @@ class EmbeddingSums:
 
 
 @dataclass(frozen=True)
+class MotionSums:
+    """What a chunk says of the regression of the dynamics."""
+
+    motion: Motion
+    embedded: Basis
+    task: TaskSpec
+    place: Place
+
+    def __call__(self, chunk: Chunk) -> RegressionSums:
+        data = chunk.load()
+        psi = self.embedded.features(self.place(state_actions(data, self.task)))
+        return RegressionSums.of(psi, self.place(self.motion.targets(data, self.task)))
+
+
+class Successors(Protocol):
+    """Features of V before each step of a chunk, and what they are expected to become."""
+
+    def __call__(self, data: Transitions) -> tuple[Array, Array]:
+        """``phi(s_i)`` and ``E[phi(s') | s_i, a_i]``, (n, r) each."""
+        ...
+
+
+@dataclass(frozen=True)
+class ObservedSuccessors:
+    """Those of a sample-based model."""
+
+    changes: FeatureChanges
+
+    def __call__(self, data: Transitions) -> tuple[Array, Array]:
+        return self.changes.both(data)
+
+
+@dataclass(frozen=True)
+class EmbeddedSuccessors:
+    """Those of the embedding (Eq. 4).
+
+    Attributes:
+        changes: features of V.
+        model: the fitted embedding.
+        task: limits and scale of the actions.
+        from_own: whether the model's successors are counted from the state's own features.
+    """
+
+    changes: FeatureChanges
+    model: FeatureRegression
+    task: TaskSpec
+    from_own: bool
+
+    def __call__(self, data: Transitions) -> tuple[Array, Array]:
+        own = self.changes.own(data)
+        expected = self.model.mean(self.changes.place(state_actions(data, self.task)))
+        if self.from_own:
+            expected += own
+        return own, expected
+
+
+@dataclass(frozen=True)
+class PredictedSuccessors:
+    """Those of the dynamics: the observed one and its mirror image in the predicted one.
+
+    Residuals are those of the fit to all samples, not of one without the sample: where there are
+    more samples than fit in memory one of them hardly counts.
+    """
+
+    changes: FeatureChanges
+    motion: Motion
+    model: FeatureRegression
+    task: TaskSpec
+
+    def __call__(self, data: Transitions) -> tuple[Array, Array]:
+        place = self.changes.place
+        own, after = self.changes.both(data)
+        predicted = self.motion.changes(self.model.mean(place(state_actions(data, self.task))))
+        mirrored = 2.0 * predicted + place(data.states - state_changes(data, self.task))
+        return own, 0.5 * (after + self.changes.ended(data, self.changes.basis.features(mirrored)))
+
+
+@dataclass(frozen=True)
 class BellmanRows:
     """Rows ``B = (1 - p) E[phi(s') | s_i, a_i] + p phi_restart - phi(s_i)`` of a chunk.
 
     Attributes:
-        changes: features of V.
-        model: the fitted embedding, or None for the observed successor.
-        task: limits and scale of the actions.
-        from_own: whether the model's successors are counted from the state's own features.
+        successors: what is expected.
         restart: (r,) mean features of the states that the process restarts in.
         restart_probability: p.
     """
 
-    changes: FeatureChanges
-    model: FeatureRegression | None
-    task: TaskSpec
-    from_own: bool
+    successors: Successors
     restart: FloatArray
     restart_probability: float
 
     def __call__(self, data: Transitions) -> Array:
         p = self.restart_probability
-        if self.model is None:
-            own, expected = self.changes.both(data)
-        else:
-            own = self.changes.own(data)
-            expected = self.model.mean(self.changes.place(state_actions(data, self.task)))
-            if self.from_own:
-                expected += own
+        own, expected = self.successors(data)
         expected *= 1.0 - p
         expected += p * like(self.restart, own)
         expected -= own
@@ -196,7 +265,7 @@ class StreamedProblem:
 
     @property
     def rank(self) -> int:
-        return len(self.rows.changes.start)
+        return len(self.rows.restart)
 
     def part(self, chosen: slice) -> StreamedProblem:
         """That of some of the chunks."""

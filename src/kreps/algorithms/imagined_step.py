@@ -1,7 +1,7 @@
 """A second bounded step on actions drawn anew, with the transition model saying what they lead to.
 
 The weights of Eq. 1 can only choose among the actions that happened to be taken, one in each state.
-The embedding of Eq. 4 predicts for *any* action, so more can be asked of the same roll-outs: in the
+A transition model predicts for *any* action, so more can be asked of the same roll-outs: in the
 states as the first step reweighted them, actions are drawn from the policy that it gave, and the
 same convex problem is solved once more for them.  The KL bound then holds from that policy, so that
 old roll-outs no longer tie the new policy to the old ones that made them.
@@ -32,24 +32,19 @@ class Outlook:
     Attributes:
         states: (n, ds).
         features: (n, r) of V there.
-        origin: (n, r) what expected features are counted from.
         restart: (r,) mean features of the states that the process restarts in.
         rewards: (n,) observed, standardised.
-        predict: maps states and scaled actions (m, ds + da) to expected features of the successor,
-            counted from the origin, and in a last column the reward, counted from its mean.
+        expect: expected features (m, r) of the successor, of sample numbers (m,) and of their
+            states and scaled, applied actions (m, ds + da).
+        reward: what reward (m,) is to be expected of such states and actions, from its mean.
     """
 
     states: FloatArray
     features: FloatArray
-    origin: FloatArray
     restart: FloatArray
     rewards: FloatArray
-    predict: Callable[[FloatArray], FloatArray]
-
-    @staticmethod
-    def targets(successors: FloatArray, rewards: FloatArray) -> FloatArray:
-        """What `predict` is to be fitted to, (n, r + 1)."""
-        return np.column_stack([successors, rewards - rewards.mean()])
+    expect: Callable[[IntArray, FloatArray], FloatArray]
+    reward: Callable[[FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
@@ -96,15 +91,17 @@ def imagine(
     rows = resample(weights, count, rng)
     states = outlook.states[rows]
     actions = policy.act(states, rng.standard_normal((count, task.action_size)))
-    predicted = outlook.predict(np.concatenate([states, task.scaled(task.clip(actions))], axis=1))
+    inputs = np.concatenate([states, task.scaled(task.clip(actions))], axis=1)
     # a regression may overshoot what was ever observed, and would be believed
     observed = outlook.rewards
-    rewards = np.clip(observed.mean() + predicted[:, -1], observed.min(), observed.max())
-    expected = outlook.origin[rows] + predicted[:, :-1]
+    rewards = np.clip(observed.mean() + outlook.reward(inputs), observed.min(), observed.max())
     problem = DualProblem(
         rewards=rewards - rewards.max(),
         differences=feature_differences(
-            outlook.features[rows], expected, outlook.restart, settings.restart_probability
+            outlook.features[rows],
+            outlook.expect(rows, inputs),
+            outlook.restart,
+            settings.restart_probability,
         ),
         kl_bound=settings.kl_bound,
         ridge=ridge / count,

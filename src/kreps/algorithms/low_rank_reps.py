@@ -8,9 +8,9 @@ memory hardly at all.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-from functools import reduce
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial, reduce
 from operator import add
 
 import numpy as np
@@ -19,11 +19,17 @@ from kreps.algorithms.chunk_sums import (
     BellmanRows,
     ChunkPolicySums,
     ChunkRewards,
+    EmbeddedSuccessors,
     EmbeddingSums,
     FeatureChanges,
+    MotionSums,
+    ObservedSuccessors,
+    PredictedSuccessors,
     StartFeatures,
     StreamedProblem,
+    Successors,
 )
+from kreps.algorithms.dynamics import Dynamics, Motion, observed_expectation
 from kreps.algorithms.imagined_step import Outlook, imagine
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
@@ -36,6 +42,7 @@ from kreps.algorithms.reps import (
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
     embedding_hyperparameters,
+    feature_differences,
     restart_features,
     state_actions,
     state_kernel,
@@ -43,7 +50,7 @@ from kreps.algorithms.transition_model import (
 from kreps.arrays import FloatArray, IntArray, as_float
 from kreps.compute import Compute
 from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.dataset import Dataset
+from kreps.dataset import Chunk, Dataset
 from kreps.dual import (
     ETA_LEAST,
     DualProblem,
@@ -52,7 +59,7 @@ from kreps.dual import (
     solve_dual,
     standardise,
 )
-from kreps.embedding import FeatureRegression, RegressionSums
+from kreps.embedding import FeatureRegression, LeaveOneOut, RegressionSums
 from kreps.kernels import Kernel
 from kreps.policies import MAX_SUPPORT
 from kreps.settings import Settings
@@ -115,37 +122,22 @@ def update(
     starts = reduce(add, compute.map(StartFeatures(basis, place), dataset.chunks))
     count = int(starts[-1])
     changes = FeatureChanges(basis, starts[:-1] / count, place)
-    own, after = replace(changes, place=as_float).both(sample)
+    here = replace(changes, place=as_float)
+    own, after = here.both(sample)
     clock.lap("basis")
 
-    # Eq. 4: the expected features of each successor, linear in features of state and action
-    bases = [basis]
-    from_own = settings.model == "change"
-    model, errors, embedding_start = None, None, None
-    if settings.model != "sample":
-        inputs = state_actions(sample, task)
-        origin = own if from_own else np.zeros_like(own)
-        successors = after - origin
-        joint_kernel, regulariser, embedding_start = embedding_hyperparameters(
-            inputs, successors, kernel, task, state.embedding_start, rng
-        )
-        clock.lap("embedding fit")
-        embedded = choose_basis(joint_kernel, inputs, settings, settings.rank, rng)
-        bases.append(embedded)
-        sums_of = EmbeddingSums(changes, embedded, task, from_own)
-        embedding_sums = reduce(add, compute.map(sums_of, dataset.chunks))
-        model = FeatureRegression.fit(embedded, embedding_sums, regulariser)
-        psi = embedded.features(inputs)
-        gram = psi.T @ psi
-        errors = FeatureRegression.leave_one_out(
-            psi, gram, successors, regulariser, n / len(sample)
-        )
+    # Eq. 4: the expected features of each successor, from features of state and action
+    expectation = expected_successors(
+        dataset, sample, changes, own, after, kernel, task, settings, state, compute, rng, clock
+    )
+    errors, embedding_start = expectation.errors, expectation.parameters
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
     ridge = stationarity_ridge(settings, errors)
     restart = restart_features(changes.start, own.mean(axis=0), settings)
-    rows = BellmanRows(changes, model, task, from_own, restart, settings.restart_probability)
+    p = settings.restart_probability
+    rows = BellmanRows(expectation.successors, restart, p)
     problem = StreamedProblem(
         dataset=dataset,
         rows=rows,
@@ -155,7 +147,9 @@ def update(
         eta_floor=max(settings.eta_floor, ETA_LEAST),
         compute=compute,
     )
-    dual = solve(problem, ridge, sample, sampled)
+    dual = solve(
+        problem, ridge, feature_differences(own, expectation.expected, restart, p), sampled
+    )
     clock.lap("dual")
 
     # Sec. 2: generalise the weighted samples to a stochastic policy
@@ -172,6 +166,7 @@ def update(
     )
     x = policy_hyperparameters(support, kernel, settings, state.policy_start, rng)
     clock.lap("policy fit")
+    bases = [basis, *expectation.bases]
     centres = policy_centres(support, kernel, x, settings, rng)
     policy_sums_of = ChunkPolicySums(centres, task, place)
     policy_sums = reduce(add, compute.map(policy_sums_of, dataset.chunks, dataset.split(weights)))
@@ -179,16 +174,19 @@ def update(
     clock.lap("policy")
 
     # the same once more, for other actions in the states of the sample
-    if settings.imagined and model is not None and seen is not None:
-        outlook_sums = RegressionSums(gram, psi.T @ Outlook.targets(successors, rewards[sampled]))
-        of_sample = FeatureRegression.fit(embedded, outlook_sums, regulariser * len(sample) / n)
+    reward_start = state.reward_start
+    if settings.imagined and expectation.of_actions is not None and seen is not None:
+        reward, reward_start, reward_basis = fit_reward(
+            sample, rewards[sampled], len(sample) / n, kernel, task, settings, reward_start, rng
+        )
+        bases.append(reward_basis)
         outlook = Outlook(
             states=sample.states,
             features=own,
-            origin=origin,
             restart=restart,
             rewards=rewards[sampled],
-            predict=of_sample.mean,
+            expect=expectation.of_actions,
+            reward=reward,
         )
         share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
@@ -209,6 +207,7 @@ def update(
         policy=policy,
         value=basis.function(reward_unit * dual.theta),
         embedding_start=embedding_start,
+        reward_start=reward_start,
         policy_start=x,
     )
     acted = [r.actions for r in newest or window.rollouts] if seen is not None else [sample.actions]
@@ -229,12 +228,136 @@ def update(
         policy_parameters=np.exp(x),
         jitter=max(
             dual.jitter,
-            0.0 if model is None else model.jitter,
+            expectation.jitter,
             *(chosen.jitter for chosen in bases if isinstance(chosen, RKHSBasis)),
         ),
         seconds=clock.seconds,
     )
     return new_state, info
+
+
+@dataclass(frozen=True)
+class Expectation:
+    """What a transition model says of V's features in the successors of n samples, in low rank.
+
+    Attributes:
+        successors: of the samples of any chunk.
+        expected: (m, r) those of the m samples in memory.
+        errors: of the model on these; None without one.
+        of_actions: as of `kreps.algorithms.reps.Expectation`, for the samples in memory.
+        parameters: log hyper-parameters that the model was fitted with.
+        bases: features of states and actions, if there is a model.
+        jitter: of its factorisation.
+    """
+
+    successors: Successors
+    expected: FloatArray
+    errors: LeaveOneOut | None = None
+    of_actions: Callable[[IntArray, FloatArray], FloatArray] | None = None
+    parameters: FloatArray | None = None
+    bases: tuple[Basis, ...] = ()
+    jitter: float = 0.0
+
+
+def expected_successors(
+    dataset: Dataset,
+    sample: Transitions,
+    changes: FeatureChanges,
+    own: FloatArray,
+    after: FloatArray,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    settings: Settings,
+    state: LearnerState,
+    compute: Compute,
+    rng: np.random.Generator,
+    clock: Stopwatch,
+) -> Expectation:
+    """Fit the transition model that the settings ask for to all samples.
+
+    Args:
+        dataset, sample: all samples, and the m of them that are in memory.
+        changes: features of V.
+        own, after: (m, r) features of V of the sample and of its observed successors.
+        state_kernel: its factors are those of the model's kernel.
+        task, settings, compute: of the update.
+        state: where the fit starts from.
+        rng: chooses the samples of the fit.
+        clock: of the stages.
+    """
+    if settings.model == "sample":
+        return Expectation(ObservedSuccessors(changes), after)
+    inputs = state_actions(sample, task)
+    from_own = settings.model == "change"
+    origin = own if from_own else np.zeros_like(own)
+    motion = Motion.of(sample, task)
+    moves = settings.model == "dynamics"
+    targets = motion.targets(sample, task) if moves else after - origin
+    joint_kernel, regulariser, parameters = embedding_hyperparameters(
+        inputs, targets, state_kernel, task, state.embedding_start, rng
+    )
+    clock.lap("embedding fit")
+    embedded = choose_basis(joint_kernel, inputs, settings, settings.rank, rng)
+    sums_of: Callable[[Chunk], RegressionSums] = (
+        MotionSums(motion, embedded, task, changes.place)
+        if moves
+        else EmbeddingSums(changes, embedded, task, from_own)
+    )
+    model = FeatureRegression.fit(
+        embedded, reduce(add, compute.map(sums_of, dataset.chunks)), regulariser
+    )
+    psi = embedded.features(inputs)
+    errors = FeatureRegression.leave_one_out(
+        psi, psi.T @ psi, targets, regulariser, len(dataset) / len(sample)
+    )
+    if moves:
+        dynamics = Dynamics(motion, model.mean, motion.changes(errors.errors))
+        expected, errors = observed_expectation(
+            sample, changes.basis, own, after, dynamics.residuals, task
+        )
+        return Expectation(
+            PredictedSuccessors(changes, motion, model, task),
+            expected,
+            errors,
+            partial(dynamics.expected_features, changes.basis, changes.start),
+            parameters,
+            (embedded,),
+            model.jitter,
+        )
+    return Expectation(
+        EmbeddedSuccessors(changes, model, task, from_own),
+        origin + model.mean(inputs),
+        errors,
+        lambda rows, asked: origin[rows] + model.mean(asked),
+        parameters,
+        (embedded,),
+        model.jitter,
+    )
+
+
+def fit_reward(
+    sample: Transitions,
+    rewards: FloatArray,
+    share: float,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    settings: Settings,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+) -> tuple[Callable[[FloatArray], FloatArray], FloatArray, Basis]:
+    """As `kreps.algorithms.transition_model.fit_reward`, of a sample that is a share of all.
+
+    It says what it would if all samples were like it; the basis is that of the regression.
+    """
+    inputs = state_actions(sample, task)
+    targets = (rewards - rewards.mean())[:, None]
+    kernel, regulariser, x = embedding_hyperparameters(
+        inputs, targets, state_kernel, task, start, rng
+    )
+    basis = choose_basis(kernel, inputs, settings, settings.rank, rng)
+    sums = RegressionSums.of(basis.features(inputs), targets)
+    regression = FeatureRegression.fit(basis, sums, regulariser * share)
+    return lambda asked: regression.mean(asked)[:, 0], x, basis
 
 
 def some(numbers: IntArray, rng: np.random.Generator) -> IntArray:
@@ -287,17 +410,18 @@ def fit_sparse(task: TaskSpec, centres: RKHSBasis, sums: PolicySums, x: FloatArr
 
 
 def solve(
-    problem: StreamedProblem, ridge: float, sample: Transitions, sampled: IntArray
+    problem: StreamedProblem, ridge: float, differences: FloatArray, sampled: IntArray
 ) -> DualSolution:
     """The dual on the sample, in memory; then on more and more chunks, each from the last solution.
+
+    ``differences`` are the rows of B of the ``sampled`` ones.
 
     A pass over all samples costs much more than one over a few, so Newton's method is to begin
     there near its end.
     """
-    rows = problem.rows
     near = DualProblem(
         rewards=problem.rewards[sampled],
-        differences=replace(rows, changes=replace(rows.changes, place=as_float))(sample),
+        differences=differences,
         kl_bound=problem.kl_bound,
         ridge=ridge / min(GROWTH * len(sampled), len(problem.rewards)),
         eta_floor=problem.eta_floor,

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
+from kreps.algorithms.dynamics import fit_dynamics, observed_expectation
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
     feature_differences,
     fit_embedding,
+    fit_reward,
     random_rows,
     restart_features,
     state_kernel,
     successor_features,
 )
-from kreps.arrays import FloatArray
+from kreps.arrays import FloatArray, IntArray
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.dual import (
     ETA_LEAST,
@@ -67,7 +70,7 @@ class UpdateInfo:
         support: support points of the policy.
         state_lengthscales: of V's kernel.
         embedding_parameters, policy_parameters: fitted values (not logs): lengthscales, then
-            lambda, or sf2 and l.
+            lambda, or sf2 and l.  The former are those of the transition model, whichever it is.
         jitter: largest jitter that a factorisation of this update needed; trial points of the
             hyper-parameter searches do not count.
         seconds: CPU seconds of this process by stage.
@@ -132,15 +135,11 @@ def update(
     clock.lap("basis")
 
     # Eq. 4: expected features of each successor
-    origin = embedding_origin(data, features, settings)
-    successors = successor_features(data, features) - origin
-    model, embedding_start = transition_model(
-        data, successors, kernel, task, settings, state.embedding_start, rng
+    expectation = expected_successors(
+        data, basis, features, kernel, task, settings, state.embedding_start, rng, clock
     )
-    clock.lap("embedding fit")
-    expected = origin + model.expected_features(successors)
+    errors = expectation.errors
     rewards, reward_unit = standardise(data.rewards)
-    errors = model.leave_one_out(successors) if isinstance(model, KernelEmbedding) else None
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
@@ -149,7 +148,9 @@ def update(
     ridge = stationarity_ridge(settings, errors)
     problem = DualProblem(
         rewards=rewards,
-        differences=feature_differences(own, expected, restart, settings.restart_probability),
+        differences=feature_differences(
+            own, expectation.expected, restart, settings.restart_probability
+        ),
         kl_bound=settings.kl_bound,
         ridge=ridge / len(data),
         eta_floor=max(settings.eta_floor, ETA_LEAST),
@@ -165,14 +166,16 @@ def update(
     clock.lap("policy")
 
     # the same once more, for other actions in these states
-    if settings.imagined and isinstance(model, KernelEmbedding):
+    reward_start = state.reward_start
+    if settings.imagined and expectation.of_actions is not None:
+        reward, reward_start = fit_reward(data, rewards, kernel, task, reward_start, rng)
         outlook = Outlook(
             states=data.states,
             features=own,
-            origin=origin,
             restart=restart,
             rewards=rewards,
-            predict=model.predictor(Outlook.targets(successors, rewards)),
+            expect=expectation.of_actions,
+            reward=reward,
         )
         imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
         dual = solve_dual(imagined.problem, start=(dual.eta, dual.theta))
@@ -186,7 +189,8 @@ def update(
         window,
         policy=policy,
         value=basis.function(reward_unit * dual.theta),
-        embedding_start=embedding_start,
+        embedding_start=expectation.parameters,
+        reward_start=reward_start,
         policy_start=policy_x,
     )
     info = UpdateInfo(
@@ -204,12 +208,14 @@ def update(
         effective_samples=effective_sample_size(dual.weights),
         support=len(support.weights),
         state_lengthscales=kernel.lengthscales,
-        embedding_parameters=None if embedding_start is None else np.exp(embedding_start),
+        embedding_parameters=(
+            None if expectation.parameters is None else np.exp(expectation.parameters)
+        ),
         policy_parameters=np.exp(policy_x),
         jitter=max(
             dual.jitter,
             policy.factor.jitter,
-            model.factor.jitter if isinstance(model, KernelEmbedding) else 0.0,
+            expectation.jitter,
         ),
         seconds=clock.seconds,
     )
@@ -225,8 +231,75 @@ def value_basis(data: Transitions, kernel: Kernel, settings: Settings) -> tuple[
     )
 
 
+@dataclass(frozen=True)
+class Expectation:
+    """What a transition model says of V's features in the successors of n samples.
+
+    Attributes:
+        expected: (n, r) ``E[phi(s') | s_i, a_i]``.
+        errors: of the model; None without one.
+        of_actions: the same (m, r) for sample numbers (m,) and other actions in their states, with
+            which they are side by side (m, ds + da); None without a model.
+        parameters: log hyper-parameters that the model was fitted with.
+        jitter: of its factorisation.
+    """
+
+    expected: FloatArray
+    errors: LeaveOneOut | None
+    of_actions: Callable[[IntArray, FloatArray], FloatArray] | None
+    parameters: FloatArray | None
+    jitter: float
+
+
+def expected_successors(
+    data: Transitions,
+    basis: Basis,
+    features: FloatArray,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    settings: Settings,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+    clock: Stopwatch,
+) -> Expectation:
+    """Fit the transition model that the settings ask for, and ask it about the samples.
+
+    Args:
+        data: n transitions.
+        basis, features: of V, and its features (m, r) of all points.
+        state_kernel: its factors are those of the model's kernel.
+        task, settings: limits of the actions, and which model.
+        start: log hyper-parameters to start the fit from.
+        rng: chooses the samples of the fit.
+        clock: of the stages.
+    """
+    if settings.model == "dynamics":
+        dynamics, regression, x = fit_dynamics(data, state_kernel, task, start, rng)
+        clock.lap("embedding fit")
+        own, after = features[data.state], successor_features(data, features)
+        expected, errors = observed_expectation(data, basis, own, after, dynamics.residuals, task)
+        after_end = features[data.start].mean(axis=0)
+        of_actions = partial(dynamics.expected_features, basis, after_end)
+        return Expectation(expected, errors, of_actions, x, regression.factor.jitter)
+    origin = embedding_origin(data, features, settings)
+    successors = successor_features(data, features) - origin
+    model, parameters = transition_model(data, successors, state_kernel, task, settings, start, rng)
+    clock.lap("embedding fit")
+    expected = origin + model.expected_features(successors)
+    if not isinstance(model, KernelEmbedding):
+        return Expectation(expected, None, None, parameters, 0.0)
+    predict = model.predictor(successors)
+    return Expectation(
+        expected,
+        model.leave_one_out(successors),
+        lambda rows, inputs: origin[rows] + predict(inputs),
+        parameters,
+        model.factor.jitter,
+    )
+
+
 def embedding_origin(data: Transitions, features: FloatArray, settings: Settings) -> FloatArray:
-    """What the embedded features are counted from, (n, r): those of the state itself, or zero.
+    """What embedded features are counted from, (n, r): those of the state itself, or zero.
 
     An embedding fades to its origin far from the data.  That the state stays is a better guess
     there than that its features vanish, and a better one to learn corrections of.

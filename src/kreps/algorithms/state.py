@@ -24,8 +24,8 @@ class LearnerState:
         rollouts, steps: roll-outs and environment steps seen, forgotten ones included.
         policy: of the latest update.
         value: V of the latest update, if the method has one in an RKHS.
-        embedding_start, policy_start: log hyper-parameters to start the next fits from, if the
-            method fits any.
+        embedding_start, reward_start, policy_start: log hyper-parameters to start the next fits
+            from, if the method fits any.
     """
 
     window: Window
@@ -35,6 +35,7 @@ class LearnerState:
     policy: LearntPolicy | None = None
     value: LinearFunction | None = None
     embedding_start: FloatArray | None = None
+    reward_start: FloatArray | None = None
     policy_start: FloatArray | None = None
 
     def extended(self, rollouts: Sequence[Rollout], task: TaskSpec) -> tuple[Window, Transitions]:

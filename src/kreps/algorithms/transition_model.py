@@ -5,6 +5,8 @@ And what every step of REPS makes of it: the differences of features, restarts i
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from kreps.arrays import FloatArray, IntArray
@@ -132,3 +134,26 @@ def fit_embedding(
         inputs, successors, state_kernel, task, start, rng
     )
     return KernelEmbedding.fit(kernel, inputs, regulariser), x
+
+
+def fit_reward(
+    data: Transitions,
+    rewards: FloatArray,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]:
+    """What reward to expect of states and applied actions, from its mean, and log parameters.
+
+    A reward may change at once where the dynamics are smooth, so it has a kernel of its own.
+
+    Arguments are those of `embedding_hyperparameters`, with ``rewards`` (n,) as targets.
+    """
+    inputs = state_actions(data, task)
+    targets = (rewards - rewards.mean())[:, None]
+    kernel, regulariser, x = embedding_hyperparameters(
+        inputs, targets, state_kernel, task, start, rng
+    )
+    predict = KernelEmbedding.fit(kernel, inputs, regulariser).predictor(targets)
+    return lambda asked: predict(asked)[:, 0], x

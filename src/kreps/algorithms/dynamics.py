@@ -1,0 +1,154 @@
+"""The transition model of the default recipe: where a state moves to, and how far that may be off.
+
+Eq. 4 learns what becomes of each feature of V by itself, hundreds of them, though all are functions
+of one successor.  Here the change of the state is what is regressed (with the machinery of Eq. 4:
+the same kernel over states and actions, the same leave-one-out fit), and V's features are taken at
+the successor that it predicts.
+
+Features at a predicted successor are not yet expected features: noise is missing, and a V that
+knows nothing of noise will be fitted to it.  What the regression of all other samples misses of a
+sample is a draw of that noise, in that very state.  So successors are spread to both sides by it,
+
+    ``E[phi(s')] = (phi(s^ + e_i) + phi(s^ - e_i)) / 2``,
+
+which has the right mean and, on average over samples, the right variance: all that counts while V
+is nearly quadratic over the reach of the noise.  For the action that was taken these two are the
+observed successor and its mirror image in the predicted one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from kreps.algorithms.transition_model import embedding_hyperparameters, state_actions
+from kreps.arrays import Array, FloatArray, IntArray, like
+from kreps.data import TaskSpec, Transitions
+from kreps.embedding import ROWS, KernelEmbedding, LeaveOneOut
+from kreps.kernels import Kernel
+from kreps.value import Basis
+
+
+def state_changes(data: Transitions, task: TaskSpec) -> FloatArray:
+    """``s'_i - s_i``, (n, ds); angles go the short way round."""
+    changes = data.points[data.successor] - data.states
+    angles = list(task.periodic)
+    changes[:, angles] = (changes[:, angles] + np.pi) % (2.0 * np.pi) - np.pi
+    return changes
+
+
+@dataclass(frozen=True)
+class Motion:
+    """What is regressed: changes of state, and whether the task ended, as numbers of order one.
+
+    Attributes:
+        unit: (ds,) root mean square change, one for all coordinates that share a lengthscale.
+    """
+
+    unit: FloatArray
+
+    @classmethod
+    def of(cls, data: Transitions, task: TaskSpec) -> Motion:
+        unit = np.ones(task.observation_size)
+        squares = np.mean(state_changes(data, task) ** 2, axis=0)
+        for factor in task.state_factors:
+            columns = list(factor.dims)
+            unit[columns] = np.sqrt(np.mean(squares[columns])) or 1.0
+        return cls(unit)
+
+    def targets(self, data: Transitions, task: TaskSpec) -> FloatArray:
+        """What is regressed of n transitions, (n, ds + 1)."""
+        return np.column_stack([state_changes(data, task) / self.unit, data.terminated])
+
+    def changes(self, targets: Array) -> Array:
+        """Changes of state (n, ds) of targets (n, ds + 1)."""
+        return targets[:, :-1] * like(self.unit, targets)
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """A regression of the change of state, and what it misses.
+
+    Attributes:
+        motion: units of what is regressed.
+        predict: its targets (m, ds + 1) of states and scaled, applied actions (m, ds + da).
+        residuals: (n, ds) changes of n samples less what all others predict of them.
+    """
+
+    motion: Motion
+    predict: Callable[[FloatArray], FloatArray]
+    residuals: FloatArray
+
+    def expected_features(
+        self, basis: Basis, start: FloatArray, rows: IntArray, inputs: FloatArray
+    ) -> FloatArray:
+        """``E[phi(s')]``, (m, r).
+
+        Args:
+            basis: of V.
+            start: (r,) mean features of the start states: what follows a real end.
+            rows: (m,) the samples whose states the actions are taken in.
+            inputs: (m, ds + da) states and scaled, applied actions.
+        """
+        expected = np.empty((len(rows), len(start)))
+        width = self.residuals.shape[1]
+        for first in range(0, len(rows), ROWS):
+            block = slice(first, first + ROWS)
+            targets = self.predict(inputs[block])
+            successors = inputs[block, :width] + self.motion.changes(targets)
+            residuals = self.residuals[rows[block]]
+            spread = 0.5 * basis.features(successors + residuals)
+            spread += 0.5 * basis.features(successors - residuals)
+            ends = np.clip(targets[:, -1:], 0.0, 1.0)
+            expected[block] = spread + ends * (start - spread)
+        return expected
+
+
+def observed_expectation(
+    data: Transitions,
+    basis: Basis,
+    own: FloatArray,
+    after: FloatArray,
+    residuals: FloatArray,
+    task: TaskSpec,
+) -> tuple[FloatArray, LeaveOneOut]:
+    """``E[phi(s') | s_i, a_i]`` (n, r) of the actions that were taken, and the model's errors.
+
+    Args:
+        data: n transitions.
+        basis: of V.
+        own, after: (n, r) features of each state and of its observed successor, of the start
+            states after a real end.
+        residuals: (n, ds) of `Dynamics`.
+        task: which coordinates are angles.
+    """
+    predicted = data.states + state_changes(data, task) - residuals
+    mirrored = basis.features(predicted - residuals)
+    mirrored[data.terminated] = after[data.terminated]
+    at_predicted = basis.features(predicted)
+    at_predicted[data.terminated] = after[data.terminated]
+    return 0.5 * (after + mirrored), LeaveOneOut(after - own, after - at_predicted)
+
+
+def fit_dynamics(
+    data: Transitions,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+) -> tuple[Dynamics, KernelEmbedding, FloatArray]:
+    """The regression of n transitions, the embedding that makes it, and its log parameters.
+
+    Arguments are those of `kreps.algorithms.transition_model.embedding_hyperparameters`.
+    """
+    motion = Motion.of(data, task)
+    targets = motion.targets(data, task)
+    inputs = state_actions(data, task)
+    kernel, regulariser, x = embedding_hyperparameters(
+        inputs, targets, state_kernel, task, start, rng
+    )
+    model = KernelEmbedding.fit(kernel, inputs, regulariser)
+    residuals = motion.changes(model.leave_one_out(targets).errors)
+    return Dynamics(motion, model.predictor(targets), residuals), model, x

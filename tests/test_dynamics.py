@@ -1,0 +1,200 @@
+"""The regression of the dynamics, and the expected features that it gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import kreps
+from kreps.algorithms.chunk_sums import FeatureChanges, PredictedSuccessors
+from kreps.algorithms.dynamics import (
+    Dynamics,
+    Motion,
+    fit_dynamics,
+    observed_expectation,
+    state_changes,
+)
+from kreps.algorithms.transition_model import state_actions, state_kernel, successor_features
+from kreps.arrays import FloatArray, as_float
+from kreps.data import Rollout, TaskSpec, Transitions
+from kreps.embedding import ROWS, FeatureRegression
+from kreps.kernels import Kernel, SquaredExponential
+from kreps.value import RKHSBasis
+
+TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
+
+
+def pushes(
+    rollouts: int = 10, steps: int = 20, noise: float = 0.0, ended: bool = False, seed: int = 0
+) -> Transitions:
+    """A mass with friction on a line, pushed at random: linear, but for its noise."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for number in range(rollouts):
+        states = [rng.normal(size=2)]
+        actions = rng.normal(0.0, 2.0, size=(steps, 1))
+        for force in TASK.clip(actions)[:, 0]:
+            velocity = 0.9 * states[-1][1] + 0.3 * force + noise * rng.normal()
+            states.append(np.array([states[-1][0] + 0.3 * velocity, velocity]))
+        rewards = np.zeros(steps)
+        found.append(Rollout(np.array(states), actions, rewards, ended and number % 2 == 0))
+    return Transitions.of(found)
+
+
+def basis_of(data: Transitions, task: TaskSpec = TASK) -> tuple[Kernel, RKHSBasis, FloatArray]:
+    kernel = state_kernel(data, task, np.random.default_rng(0))
+    return kernel, *RKHSBasis.fit(kernel, data.points, tolerance=1e-8, max_rank=200)
+
+
+def test_angles_change_the_short_way_round() -> None:
+    task = TaskSpec(2, np.array([-1.0]), np.array([1.0]), periodic=(0,))
+    observations = np.array([[3.0, 3.0], [-3.0, -3.0], [3.0, 3.0]])
+    data = Transitions.of([Rollout(observations, np.zeros((2, 1)), np.zeros(2))])
+    short = 2.0 * np.pi - 6.0
+    np.testing.assert_allclose(state_changes(data, task), [[short, -6.0], [-short, 6.0]])
+
+
+def test_coordinates_that_share_a_lengthscale_share_a_unit() -> None:
+    task = TaskSpec(4, np.array([-1.0]), np.array([1.0]), groups=((0, 1),))
+    observations = np.zeros((3, 4))
+    observations[:, 0] = 0.0, 3.0, 0.0
+    observations[:, 1] = 0.0, 4.0, 0.0
+    observations[:, 2] = 0.0, 0.5, 1.0  # and the last one never moves
+    data = Transitions.of([Rollout(observations, np.zeros((2, 1)), np.zeros(2), terminated=True)])
+    motion = Motion.of(data, task)
+    np.testing.assert_allclose(motion.unit, [12.5**0.5, 12.5**0.5, 0.5, 1.0])
+    targets = motion.targets(data, task)
+    np.testing.assert_array_equal(targets[:, -1], [0.0, 1.0])
+    np.testing.assert_allclose(motion.changes(targets), state_changes(data, task))
+
+
+def test_without_noise_it_says_where_any_action_leads() -> None:
+    data = pushes()
+    kernel, basis, features = basis_of(data)
+    dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    assert np.abs(dynamics.residuals).max() < 1e-2
+    actions = np.random.default_rng(2).uniform(-2.0, 2.0, size=len(data))
+    velocity = 0.9 * data.states[:, 1] + 0.3 * actions
+    successors = np.stack([data.states[:, 0] + 0.3 * velocity, velocity], axis=1)
+    inputs = np.column_stack([data.states, actions / 2.0])
+    rows = np.arange(len(data))
+    found = dynamics.expected_features(basis, features[0], rows, inputs)
+    np.testing.assert_allclose(found, basis.features(successors), atol=5e-3)
+    assert np.abs(found - features[data.successor]).max() > 0.1  # other actions, other successors
+
+
+def test_of_the_taken_actions_it_expects_the_observed_and_its_mirror_image() -> None:
+    data = pushes(noise=0.3)
+    kernel, basis, features = basis_of(data)
+    dynamics, model, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    own, after = features[data.state], features[data.successor]
+    expected, errors = observed_expectation(data, basis, own, after, dynamics.residuals, TASK)
+    # what a model of all other samples says, one by one
+    targets = dynamics.motion.targets(data, TASK)
+    for i in range(0, len(data), 17):
+        rest = np.arange(len(data)) != i
+        refit = type(model).fit(model.kernel, model.inputs[rest], model.regulariser)
+        said = refit.strengths(model.inputs[i : i + 1])[:, 0] @ targets[rest]
+        predicted = data.states[i] + dynamics.motion.changes(said[None])
+        mirrored = 2.0 * predicted - data.points[data.successor[i]]
+        np.testing.assert_allclose(
+            expected[i], 0.5 * (after[i] + basis.features(mirrored)[0]), atol=1e-8
+        )
+        np.testing.assert_allclose(
+            errors.errors[i], after[i] - basis.features(predicted)[0], atol=1e-8
+        )
+        np.testing.assert_array_equal(errors.targets[i], after[i] - own[i])
+
+
+def test_the_spread_is_that_of_the_noise() -> None:
+    """Where features are nearly quadratic, their expectation is right on average."""
+    noise = 0.2
+    data = pushes(60, 20, noise=noise)
+    kernel, _, _ = basis_of(data)
+    wide = kernel.with_lengthscales(np.array([1e3, 5.0]))
+    basis = RKHSBasis(velocity_alone(wide), np.zeros((1, 2)), np.eye(1), 0.0)
+    dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    inputs, rows = state_actions(data, TASK), np.arange(len(data))
+    found = dynamics.expected_features(basis, np.zeros(1), rows, inputs)[:, 0]
+    velocity = 0.9 * data.states[:, 1] + 0.3 * TASK.clip(data.actions)[:, 0]
+    # E exp(-v^2 / (2 l^2)) of a normal v
+    variance = 25.0 + noise**2
+    wanted = 5.0 / variance**0.5 * np.exp(-0.5 * velocity**2 / variance)
+    unaware = np.exp(-0.5 * velocity**2 / 25.0)
+    assert abs(np.mean(found - wanted)) < 0.2 * abs(np.mean(unaware - wanted))
+
+
+def velocity_alone(kernel: Kernel) -> Kernel:
+    """The velocity alone."""
+    return Kernel((SquaredExponential((1,)),), kernel.lengthscales[1:])
+
+
+def test_a_real_end_leads_to_the_start() -> None:
+    data = pushes(ended=True)
+    kernel, basis, features = basis_of(data)
+    start = features[data.start].mean(axis=0)
+    own, after = features[data.state], successor_features(data, features)
+    dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    expected, errors = observed_expectation(data, basis, own, after, dynamics.residuals, TASK)
+    assert data.terminated.sum() == 5
+    np.testing.assert_allclose(expected[data.terminated], np.tile(start, (5, 1)))
+    np.testing.assert_array_equal(errors.errors[data.terminated], 0.0)
+
+    def always(inputs: FloatArray) -> FloatArray:
+        return np.full((len(inputs), 3), 1.7)  # more than certain
+
+    sure = Dynamics(dynamics.motion, always, dynamics.residuals)
+    found = sure.expected_features(basis, start, np.arange(9), state_actions(data, TASK)[:9])
+    np.testing.assert_allclose(found, np.tile(start, (9, 1)), atol=1e-12)
+
+
+def test_the_end_of_a_task_is_foreseen() -> None:
+    """It ends beyond a line, and a policy that crosses it is told so."""
+    rng = np.random.default_rng(0)
+    rollouts = []
+    for _ in range(150):
+        observations = rng.uniform(-1.0, 1.0, size=(2, 2))
+        action = rng.uniform(-2.0, 2.0, size=(1, 1))
+        observations[1] = observations[0] + [0.5 * action[0, 0], 0.0]
+        rollouts.append(Rollout(observations, action, np.zeros(1), observations[1, 0] > 0.5))
+    data = Transitions.of(rollouts)
+    kernel, basis, _ = basis_of(data)
+    dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    far, near = (dynamics.predict(np.array([[0.0, 0.0, a]]))[0, -1] for a in (0.9, -0.9))
+    assert far > 0.7 > 0.3 > near
+    start = np.full(basis.lower.shape[0], 9.0)
+    inputs = np.array([[0.0, 0.0, 0.9], [0.0, 0.0, -0.9]])
+    found = dynamics.expected_features(basis, start, np.zeros(2, dtype=np.intp), inputs)
+    assert found[0].mean() > 6.0 > 3.0 > found[1].mean()
+
+
+def test_many_inputs_are_predicted_block_by_block() -> None:
+    data = pushes(noise=0.1)
+    kernel, basis, features = basis_of(data)
+    dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    rows = np.random.default_rng(3).integers(len(data), size=ROWS + 7)
+    inputs = state_actions(data, TASK)[rows]
+    found = dynamics.expected_features(basis, features[0], rows, inputs)
+    last = dynamics.expected_features(basis, features[0], rows[-7:], inputs[-7:])
+    np.testing.assert_allclose(found[-7:], last, atol=1e-12)
+
+
+@pytest.mark.parametrize("ended", [False, True])
+def test_chunks_are_told_of_the_observed_and_its_mirror_image(ended: bool) -> None:
+    data = pushes(noise=0.3, ended=ended)
+    kernel, basis, features = basis_of(data)
+    dynamics, model, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    start = features[data.start].mean(axis=0)
+    regression = FeatureRegression(dynamics.predict, 0.0)
+    changes = FeatureChanges(basis, start, as_float)
+    own, expected = PredictedSuccessors(changes, dynamics.motion, regression, TASK)(data)
+    np.testing.assert_allclose(own, features[data.state], atol=1e-8)
+    said = dynamics.motion.changes(model.expected_features(dynamics.motion.targets(data, TASK)))
+    mirrored = basis.features(2.0 * (data.states + said) - data.points[data.successor])
+    after = successor_features(data, features)
+    wanted = 0.5 * (after + np.where(data.terminated[:, None], start, mirrored))
+    np.testing.assert_allclose(expected, wanted, atol=1e-6)
+
+
+def test_the_default_recipe_learns_of_it() -> None:
+    assert kreps.KREPS(TASK).settings.model == "dynamics"
