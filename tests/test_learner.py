@@ -303,12 +303,12 @@ def test_stochastic_prediction_has_the_moments_of_the_policy(learnt: kreps.KREPS
 def test_stochastic_prediction_draws_anew_each_time(learnt: kreps.KREPS) -> None:
     policy = learnt.policy
     # most of them may be clipped
-    actions = [float(policy.predict([np.pi, 0.0])[0][0]) for _ in range(30)]
+    actions = [float(policy.predict([np.pi, 0.0])[0][0]) for _ in range(300)]
     assert len(set(actions)) > 3
 
 
 def test_the_predict_of_the_learner_draws_anew_each_time_too(learnt: kreps.KREPS) -> None:
-    actions = [float(learnt.predict([np.pi, 0.0])[0][0]) for _ in range(30)]
+    actions = [float(learnt.predict([np.pi, 0.0])[0][0]) for _ in range(300)]
     assert len(set(actions)) > 3
 
 

@@ -232,7 +232,7 @@ def assert_same_state(a: LearnerState, b: LearnerState) -> None:
         for name in ("observations", "actions", "rewards"):
             np.testing.assert_array_equal(getattr(mine, name), getattr(theirs, name))
         assert mine.terminated == theirs.terminated
-    for name in ("policy_start", "embedding_start"):
+    for name in ("policy_start", "embedding_start", "reward_start"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
     assert (a.policy is None) == (b.policy is None)
     if a.policy is not None:
@@ -263,6 +263,7 @@ def test_a_checkpoint_leaves_out_nothing_of_the_state() -> None:
         "policy",
         "value",
         "embedding_start",
+        "reward_start",
         "policy_start",
     }
 
@@ -654,7 +655,7 @@ def test_one_nan_or_infinity_in_any_array_is_refused(good: Good, tmp_path: Path)
         assert name in good.refused_with(tmp_path / "x", spoilt)
 
 
-OPTIONAL = {"window.lengths", "start.embedding", "start.policy"}
+OPTIONAL = {"window.lengths", "start.embedding", "start.reward", "start.policy"}
 """Arrays that a checkpoint may be without: before anything was learnt, or in some methods."""
 
 

@@ -35,6 +35,7 @@ from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
     PolicySamples,
     UpdateInfo,
+    drawn_noise,
     policy_hyperparameters,
     share_clipped,
     stationarity_ridge,
@@ -170,7 +171,7 @@ def update(
     centres = policy_centres(support, kernel, x, settings, rng)
     policy_sums_of = ChunkPolicySums(centres, task, place)
     policy_sums = reduce(add, compute.map(policy_sums_of, dataset.chunks, dataset.split(weights)))
-    policy = fit_sparse(task, centres, policy_sums, x)
+    policy = fit_sparse(task, centres, policy_sums, x, float(np.exp(x[-1])))
     clock.lap("policy")
 
     # the same once more, for other actions in the states of the sample
@@ -194,10 +195,11 @@ def update(
         support = PolicySamples.imagined(sample, imagined, dual.weights, task)
         x = policy_hyperparameters(support, kernel, settings, x, rng)
         centres = policy_centres(support, kernel, x, settings, rng)
-        policy_sums = PolicySums.of(
-            centres.features(support.states), support.weights, support.targets
-        )
-        policy = fit_sparse(task, centres, policy_sums, x)
+        fitted = float(np.exp(x[-1]))
+        drawn = drawn_noise(support, fitted)
+        weights = support.weights * (drawn / fitted)  # as in the exact `fit_policy`
+        policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
+        policy = fit_sparse(task, centres, policy_sums, x, drawn)
         clock.lap("imagined step")
     bases.append(centres)
 
@@ -402,11 +404,11 @@ def policy_centres(
     return choose_centres(policy_kernel, support.states, rank, settings, rng)
 
 
-def fit_sparse(task: TaskSpec, centres: RKHSBasis, sums: PolicySums, x: FloatArray) -> SparseGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,)."""
-    return SparseGP.fit(
-        task, centres, sums, signal=float(np.exp(x[-2])), noise=float(np.exp(x[-1]))
-    )
+def fit_sparse(
+    task: TaskSpec, centres: RKHSBasis, sums: PolicySums, x: FloatArray, noise: float
+) -> SparseGP:
+    """The policy at log hyper-parameters ``x`` (g + 2,), its actions drawn with ``noise``."""
+    return SparseGP.fit(task, centres, sums, signal=float(np.exp(x[-2])), noise=noise)
 
 
 def solve(

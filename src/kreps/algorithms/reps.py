@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from math import inf
 
 import numpy as np
 
@@ -41,8 +42,12 @@ from kreps.value import Basis, RBFGrid, RKHSBasis
 DROPPED_WEIGHT = 0.05
 """Samples with ``n p_i`` below this do not enter the policy: they say next to nothing."""
 
-RIDGE_LEAST = 1e-6
-"""Least ridge where the model asks for none: it keeps V finite in directions that no state has."""
+LEAST_NOISE = 1e-4
+"""Least variance of the drawn actions, in units of the action scale squared."""
+
+RIDGE_LEAST = 1e-3
+"""Least ridge where the model asks for less: with a model without error V would follow the chance
+of a finite sample, and V must stay finite in directions that no state has."""
 
 _NOTES = {
     Outcome.AT_FLOOR: "eta at its floor",
@@ -346,6 +351,8 @@ class PolicySamples:
         weights: (m,) ``p_i / sum p^2``: over all samples they add up to the effective sample size.
         evidence: sum of the weights of all samples kept, whether or not they are among these.
         within: (m,) variance of what each target is the mean of, summed over its coordinates.
+        spread: variance of a coordinate of the weighted actions within a state, on average;
+            infinite where there is one action in each.
     """
 
     states: FloatArray
@@ -353,6 +360,7 @@ class PolicySamples:
     weights: FloatArray
     evidence: float
     within: FloatArray
+    spread: float = inf
 
     @classmethod
     def of(cls, data: Transitions, p: FloatArray, task: TaskSpec) -> PolicySamples:
@@ -381,8 +389,13 @@ class PolicySamples:
         np.add.at(weights, group, each)
         np.add.at(targets, group, (each / weights[group])[:, None] * actions)
         squares = np.sum((actions - targets[group]) ** 2, axis=1)
-        np.add.at(within, group, each / weights[group] * squares)
-        return cls(data.states[rows], targets, weights, float(weights.sum()), within)
+        share = each / weights[group]
+        np.add.at(within, group, share * squares)
+        # a mean of few is nearer to them than the one of all: Bessel's correction, with weights
+        freedom = float(weights.sum() - each @ share) * task.action_size
+        spread = float(weights @ within) / freedom if freedom > 1e-9 * weights.sum() else inf
+        evidence = float(weights.sum())
+        return cls(data.states[rows], targets, weights, evidence, within, spread)
 
 
 def policy_hyperparameters(
@@ -434,16 +447,30 @@ def policy_hyperparameters(
     return minimise(loss, prior, centre if start is None else start)
 
 
+def drawn_noise(samples: PolicySamples, fitted: float) -> float:
+    """Noise that actions are drawn with, in units of the action scale squared.
+
+    The fitted noise l has in it what the mean misses of its targets, which is much where these
+    jump.  Actions are drawn with no more than the weighted actions spread within a state.
+    """
+    return min(fitted, max(samples.spread, LEAST_NOISE))
+
+
 def fit_policy(
     samples: PolicySamples, state_kernel: Kernel, task: TaskSpec, x: FloatArray
 ) -> CostSensitiveGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,)."""
+    """The policy at log hyper-parameters ``x`` (g + 2,).
+
+    Weights shrink along with the noise, so that ``l / w_i``, and with it the mean, stays as fitted.
+    """
+    fitted = float(np.exp(x[-1]))
+    drawn = drawn_noise(samples, fitted)
     return CostSensitiveGP(
         task,
         state_kernel.with_lengthscales(np.exp(x[:-2])),
         samples.states,
         samples.targets,
-        samples.weights,
+        samples.weights * (drawn / fitted),
         signal=float(np.exp(x[-2])),
-        noise=float(np.exp(x[-1])),
+        noise=drawn,
     )
