@@ -385,7 +385,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         rank_residual=0.0,
         support=900,
         jitter=0.0,
-        policy_parameters=np.array([1.0, 2.0, 0.5, 0.09]),
+        noise=0.09,
         model_error=float("nan"),
         clipped=0.25,
         eta_floor=0.1,

@@ -14,7 +14,7 @@ from kreps.algorithms.dynamics import (
     observed_expectation,
     state_changes,
 )
-from kreps.algorithms.transition_model import state_actions, state_kernel, successor_features
+from kreps.algorithms.transition_model import state_actions, state_kernel
 from kreps.arrays import FloatArray, as_float
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.embedding import ROWS, FeatureRegression
@@ -88,7 +88,8 @@ def test_of_the_taken_actions_it_expects_the_observed_and_its_mirror_image() -> 
     kernel, basis, features = basis_of(data)
     dynamics, model, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
     own, after = features[data.state], features[data.successor]
-    expected, errors = observed_expectation(data, basis, own, after, dynamics.residuals, TASK)
+    start = features[data.start].mean(axis=0)
+    expected, errors = observed_expectation(data, basis, own, after, start, dynamics, TASK)
     # what a model of all other samples says, one by one
     targets = dynamics.motion.targets(data, TASK)
     for i in range(0, len(data), 17):
@@ -133,19 +134,39 @@ def test_a_real_end_leads_to_the_start() -> None:
     data = pushes(ended=True)
     kernel, basis, features = basis_of(data)
     start = features[data.start].mean(axis=0)
-    own, after = features[data.state], successor_features(data, features)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
-    expected, errors = observed_expectation(data, basis, own, after, dynamics.residuals, TASK)
-    assert data.terminated.sum() == 5
-    np.testing.assert_allclose(expected[data.terminated], np.tile(start, (5, 1)))
-    np.testing.assert_array_equal(errors.errors[data.terminated], 0.0)
 
     def always(inputs: FloatArray) -> FloatArray:
         return np.full((len(inputs), 3), 1.7)  # more than certain
 
-    sure = Dynamics(dynamics.motion, always, dynamics.residuals)
+    sure = Dynamics(dynamics.motion, always, dynamics.missed)
     found = sure.expected_features(basis, start, np.arange(9), state_actions(data, TASK)[:9])
     np.testing.assert_allclose(found, np.tile(start, (9, 1)), atol=1e-12)
+
+
+def test_ends_by_chance_are_expected_of_every_step() -> None:
+    """What ended is no more likely to have ended than all else, and that is counted as an error."""
+    rng = np.random.default_rng(0)
+    rollouts = []
+    for _ in range(400):
+        observations = rng.normal(size=(2, 2))
+        observations[1] = 0.9 * observations[0]
+        ended = bool(rng.uniform() < 0.3)
+        rollouts.append(Rollout(observations, rng.normal(size=(1, 1)), np.zeros(1), ended))
+    data = Transitions.of(rollouts)
+    kernel, basis, features = basis_of(data)
+    start = np.full(features.shape[1], 9.0)
+    dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    own, observed = features[data.state], features[data.successor]
+    expected, errors = observed_expectation(data, basis, own, observed, start, dynamics, TASK)
+    share = np.mean((expected - observed) / (start - observed), axis=1)
+    assert share[data.terminated].mean() == pytest.approx(0.3, abs=0.06)
+    assert share[~data.terminated].mean() == pytest.approx(0.3, abs=0.06)
+    after = np.where(data.terminated[:, None], start, observed)
+    np.testing.assert_allclose(errors.targets, after - own)
+    # of a chance p: p (1 - p) times the squared distance
+    wanted = 0.21 * np.mean(np.sum((start - observed) ** 2, axis=1))
+    assert errors.mean_square == pytest.approx(wanted, rel=0.15)
 
 
 def test_the_end_of_a_task_is_foreseen() -> None:
@@ -189,11 +210,20 @@ def test_chunks_are_told_of_the_observed_and_its_mirror_image(ended: bool) -> No
     changes = FeatureChanges(basis, start, as_float)
     own, expected = PredictedSuccessors(changes, dynamics.motion, regression, TASK)(data)
     np.testing.assert_allclose(own, features[data.state], atol=1e-8)
-    said = dynamics.motion.changes(model.expected_features(dynamics.motion.targets(data, TASK)))
-    mirrored = basis.features(2.0 * (data.states + said) - data.points[data.successor])
-    after = successor_features(data, features)
-    wanted = 0.5 * (after + np.where(data.terminated[:, None], start, mirrored))
-    np.testing.assert_allclose(expected, wanted, atol=1e-6)
+    said = model.expected_features(dynamics.motion.targets(data, TASK))
+    predicted = data.states + dynamics.motion.changes(said)
+    mirrored = basis.features(2.0 * predicted - data.points[data.successor])
+    spread = 0.5 * (features[data.successor] + mirrored)
+    ends = np.clip(said[:, -1:], 0.0, 1.0)
+    assert (ends.max() > 0.01) == ended
+    np.testing.assert_allclose(expected, spread + ends * (start - spread), atol=1e-6)
+
+
+def test_rounding_is_not_learnt() -> None:
+    still = 1.0 + 3e-16 * np.random.default_rng(0).integers(-1, 2, size=(4, 1))
+    observations = np.column_stack([np.arange(4.0), still])
+    data = Transitions.of([Rollout(observations, np.zeros((3, 1)), np.zeros(3))])
+    np.testing.assert_allclose(Motion.of(data, TASK).unit, [1.0, 1.0])
 
 
 def test_the_default_recipe_learns_of_it() -> None:

@@ -180,7 +180,7 @@ def test_leave_one_out_errors_of_a_regression_are_those_of_refits(
         gram = psi.T @ (count[:, None] * psi) + regulariser * np.eye(6)
         coefficients = np.linalg.solve(gram, psi.T @ (count[:, None] * targets))
         wanted.append(targets[i] - psi[i] @ coefficients)
-    found = FeatureRegression.leave_one_out(psi, psi.T @ psi, targets, regulariser, float(copies))
+    found = FeatureRegression.leave_one_out(psi, targets, regulariser, float(copies))
     np.testing.assert_array_equal(found.targets, targets)
     np.testing.assert_allclose(found.errors, wanted, atol=1e-9)
 
@@ -188,7 +188,7 @@ def test_leave_one_out_errors_of_a_regression_are_those_of_refits(
 def test_leave_one_out_errors_on_all_features_are_those_of_the_embedding() -> None:
     model, targets = fitted(40, 19, 0.05)
     _, psi = RKHSBasis.fit(model.kernel, model.inputs, tolerance=1e-14, max_rank=40)
-    found = FeatureRegression.leave_one_out(psi, psi.T @ psi, targets, 0.05)
+    found = FeatureRegression.leave_one_out(psi, targets, 0.05)
     np.testing.assert_allclose(found.errors, model.leave_one_out(targets).errors, atol=1e-8)
 
 

@@ -308,10 +308,10 @@ def features(data: Transitions) -> FloatArray:
     return reps.value_basis(data, kernel, Settings())[1]
 
 
-def test_the_default_counts_from_the_state_and_the_paper_from_zero(
+def test_changes_are_counted_from_the_state_and_the_paper_counts_from_zero(
     data: Transitions, features: FloatArray
 ) -> None:
-    own = reps.embedding_origin(data, features, kreps.KREPS(TASK).settings)
+    own = reps.embedding_origin(data, features, kreps.KREPS(TASK, recipe="observed").settings)
     np.testing.assert_array_equal(own, features[data.state])
     zero = reps.embedding_origin(data, features, kreps.KREPS(TASK, recipe="paper").settings)
     np.testing.assert_array_equal(zero, np.zeros_like(own))

@@ -26,8 +26,8 @@ from kreps.algorithms.reps import (
 from kreps.algorithms.state import Stopwatch
 from kreps.algorithms.transition_model import (
     feature_differences,
-    fit_reward,
     restart_features,
+    reward_regression,
     state_actions,
     state_kernel,
 )
@@ -142,8 +142,11 @@ class Case:
             data, basis, features, kernel, TASK, settings, None, rng, Stopwatch()
         )
         rewards, _ = standardise(data.rewards)
-        reward, _ = fit_reward(data, rewards, kernel, TASK, None, rng)
-        return cls(data, settings, features, rewards, expectation, reward)
+        inputs, targets, reward_kernel, regulariser, _ = reward_regression(
+            data, rewards, kernel, TASK, None, rng
+        )
+        regression = KernelEmbedding.fit(reward_kernel, inputs, regulariser)
+        return cls(data, settings, features, rewards, expectation, regression.predictor(targets))
 
     def outlook(self, reward: Callable[[FloatArray], FloatArray] | None = None) -> Outlook:
         assert self.expectation.of_actions is not None
@@ -188,7 +191,7 @@ def test_of_the_observed_actions_the_model_says_what_the_first_step_was_told(mod
     wanted = feature_differences(outlook.features, case.expectation.expected, outlook.restart, p)
     assert np.abs(wanted).max() > 0.1
     np.testing.assert_allclose(found.problem.differences, wanted, atol=1e-8)
-    said = case.rewards.mean() + outlook.reward(state_actions(data, TASK))
+    said = case.rewards.mean() + outlook.reward(state_actions(data, TASK))[:, 0]
     said = np.clip(said, case.rewards.min(), case.rewards.max())
     np.testing.assert_allclose(found.problem.rewards, said - said.max(), atol=1e-8)
     assert np.corrcoef(said, case.rewards)[0, 1] > 0.9
@@ -224,7 +227,7 @@ def test_the_model_is_asked_about_the_applied_actions_and_the_commanded_ones_are
 
     def reward(inputs: FloatArray) -> FloatArray:
         asked.append(inputs)
-        return np.zeros(len(inputs))
+        return np.zeros((len(inputs), 1))
 
     found = case.imagined(Given(commanded), reward=reward)
     np.testing.assert_array_equal(found.actions, commanded)
@@ -237,7 +240,7 @@ def test_no_reward_beyond_the_observed_ones_is_believed() -> None:
     case = Case.of(imagined=1)
     n = len(case.data)
     overshooting = np.linspace(-100.0, 100.0, n)
-    found = case.imagined(Given(np.zeros((n, 1))), reward=lambda inputs: overshooting)
+    found = case.imagined(Given(np.zeros((n, 1))), reward=lambda inputs: overshooting[:, None])
     rewards = found.problem.rewards
     assert rewards.max() == 0.0
     assert rewards.min() == pytest.approx(-np.ptp(case.rewards))

@@ -155,17 +155,15 @@ class FeatureRegression:
     @staticmethod
     def leave_one_out(
         psi: FloatArray,
-        gram: FloatArray,
         targets: FloatArray,
         regulariser: float,
         stands_for: float = 1.0,
     ) -> LeaveOneOut:
         """That of a regression of targets (n, r) on features psi (n, q), in closed form.
 
-        Where these are a part of the samples, each ``stands_for`` as many of them.  ``gram`` is
-        ``psi'psi``.
+        Where these are a part of the samples, each ``stands_for`` as many of them.
         """
-        factor = cholesky(with_diagonal(stands_for * gram, regulariser))
+        factor = cholesky(with_diagonal(stands_for * (psi.T @ psi), regulariser))
         residuals = targets - psi @ factor.solve(stands_for * (psi.T @ targets))
         whitened = solve_lower(factor.lower, psi.T)
         leverage = np.minimum(np.einsum("ij,ij->j", whitened, whitened), 1.0 - 1e-12)

@@ -261,7 +261,7 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "model_error": info.model_error,
         "clipped": info.clipped,
         "eta_floor": info.eta_floor,
-        "policy_noise": math.sqrt(info.policy_parameters[-1]),
+        "policy_noise": math.sqrt(info.noise),
         "max_rank": rank_cap(learner.settings),
         "ridge": info.ridge,
         **{f"cpu_seconds_{s.replace(' ', '_')}": round(seconds.get(s, 0.0), 5) for s in STAGES},

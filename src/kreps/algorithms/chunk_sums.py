@@ -13,9 +13,9 @@ from typing import Protocol, TypeVar
 
 import numpy as np
 
-from kreps.algorithms.dynamics import Motion, state_changes
+from kreps.algorithms.dynamics import Motion, after_ends, state_changes
 from kreps.algorithms.transition_model import state_actions
-from kreps.arrays import Array, FloatArray, as_numpy, like, rows
+from kreps.arrays import Array, FloatArray, as_numpy, like, namespace, rows
 from kreps.compute import Compute
 from kreps.data import TaskSpec, Transitions
 from kreps.dataset import Chunk, Dataset
@@ -81,15 +81,16 @@ class FeatureChanges:
         """``phi(s_i)``, (n, r)."""
         return self.basis.features(self.place(data.states))
 
-    def both(self, data: Transitions) -> tuple[Array, Array]:
-        """``phi(s_i)`` and the observed ``phi(s'_i)``, (n, r) each."""
+    def observed(self, data: Transitions) -> tuple[Array, Array]:
+        """``phi(s_i)`` and ``phi(s'_i)``, (n, r) each, whether or not the task ended there."""
         points = self.basis.features(self.place(data.points))
-        return rows(points, data.state), self.ended(data, rows(points, data.successor))
+        return rows(points, data.state), rows(points, data.successor)
 
-    def ended(self, data: Transitions, after: Array) -> Array:
-        """Features (n, r) of successors with those of the start states after a real end."""
+    def both(self, data: Transitions) -> tuple[Array, Array]:
+        """The same with the start in place of a successor that the task ended in."""
+        own, after = self.observed(data)
         ended = like(data.terminated[:, None].astype(np.float64), after)
-        return after + ended * (like(self.start, after) - after)
+        return own, after_ends(after, ended, self.start)
 
 
 @dataclass(frozen=True)
@@ -187,10 +188,12 @@ class PredictedSuccessors:
 
     def __call__(self, data: Transitions) -> tuple[Array, Array]:
         place = self.changes.place
-        own, after = self.changes.both(data)
-        predicted = self.motion.changes(self.model.mean(place(state_actions(data, self.task))))
-        mirrored = 2.0 * predicted + place(data.states - state_changes(data, self.task))
-        return own, 0.5 * (after + self.changes.ended(data, self.changes.basis.features(mirrored)))
+        own, observed = self.changes.observed(data)
+        targets = self.model.mean(place(state_actions(data, self.task)))
+        away = place(data.states - state_changes(data, self.task))
+        mirrored = self.changes.basis.features(2.0 * self.motion.changes(targets) + away)
+        ends = namespace(targets).clip(targets[:, -1:], 0.0, 1.0)
+        return own, after_ends(0.5 * (observed + mirrored), ends, self.changes.start)
 
 
 @dataclass(frozen=True)

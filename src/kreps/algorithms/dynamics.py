@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -39,6 +40,10 @@ def state_changes(data: Transitions, task: TaskSpec) -> FloatArray:
     return changes
 
 
+ROUNDING = 1e-12
+"""Changes below this share of a coordinate's size are none: its rounding is not to be learnt."""
+
+
 @dataclass(frozen=True)
 class Motion:
     """What is regressed: changes of state, and whether the task ended, as numbers of order one.
@@ -55,7 +60,9 @@ class Motion:
         squares = np.mean(state_changes(data, task) ** 2, axis=0)
         for factor in task.state_factors:
             columns = list(factor.dims)
-            unit[columns] = np.sqrt(np.mean(squares[columns])) or 1.0
+            size = np.sqrt(np.mean(squares[columns]))
+            if size > ROUNDING * np.abs(data.points[:, columns]).max():
+                unit[columns] = size
         return cls(unit)
 
     def targets(self, data: Transitions, task: TaskSpec) -> FloatArray:
@@ -67,6 +74,11 @@ class Motion:
         return targets[:, :-1] * like(self.unit, targets)
 
 
+def after_ends(features: Array, ends: Array, start: FloatArray) -> Array:
+    """Features (n, r) of successors, replaced by those of the start in a share of ends (n, 1)."""
+    return features + ends * (like(start, features) - features)
+
+
 @dataclass(frozen=True)
 class Dynamics:
     """A regression of the change of state, and what it misses.
@@ -74,12 +86,17 @@ class Dynamics:
     Attributes:
         motion: units of what is regressed.
         predict: its targets (m, ds + 1) of states and scaled, applied actions (m, ds + da).
-        residuals: (n, ds) changes of n samples less what all others predict of them.
+        missed: (n, ds + 1) targets of n samples less what all others predict of them.
     """
 
     motion: Motion
     predict: Callable[[FloatArray], FloatArray]
-    residuals: FloatArray
+    missed: FloatArray
+
+    @cached_property
+    def residuals(self) -> FloatArray:
+        """Changes of state (n, ds) less what all other samples predict of them."""
+        return self.motion.changes(self.missed)
 
     def expected_features(
         self, basis: Basis, start: FloatArray, rows: IntArray, inputs: FloatArray
@@ -101,8 +118,7 @@ class Dynamics:
             residuals = self.residuals[rows[block]]
             spread = 0.5 * basis.features(successors + residuals)
             spread += 0.5 * basis.features(successors - residuals)
-            ends = np.clip(targets[:, -1:], 0.0, 1.0)
-            expected[block] = spread + ends * (start - spread)
+            expected[block] = after_ends(spread, np.clip(targets[:, -1:], 0.0, 1.0), start)
         return expected
 
 
@@ -110,8 +126,9 @@ def observed_expectation(
     data: Transitions,
     basis: Basis,
     own: FloatArray,
-    after: FloatArray,
-    residuals: FloatArray,
+    observed: FloatArray,
+    start: FloatArray,
+    dynamics: Dynamics,
     task: TaskSpec,
 ) -> tuple[FloatArray, LeaveOneOut]:
     """``E[phi(s') | s_i, a_i]`` (n, r) of the actions that were taken, and the model's errors.
@@ -119,17 +136,19 @@ def observed_expectation(
     Args:
         data: n transitions.
         basis: of V.
-        own, after: (n, r) features of each state and of its observed successor, of the start
-            states after a real end.
-        residuals: (n, ds) of `Dynamics`.
+        own, observed: (n, r) features of each state and of its successor, whether or not the task
+            ended there.
+        start: (r,) mean features of the start states: what follows a real end.
+        dynamics: of these transitions.
         task: which coordinates are angles.
     """
-    predicted = data.states + state_changes(data, task) - residuals
-    mirrored = basis.features(predicted - residuals)
-    mirrored[data.terminated] = after[data.terminated]
-    at_predicted = basis.features(predicted)
-    at_predicted[data.terminated] = after[data.terminated]
-    return 0.5 * (after + mirrored), LeaveOneOut(after - own, after - at_predicted)
+    terminated = data.terminated[:, None].astype(np.float64)
+    ends = np.clip(terminated - dynamics.missed[:, -1:], 0.0, 1.0)
+    predicted = data.states + state_changes(data, task) - dynamics.residuals
+    spread = 0.5 * (observed + basis.features(predicted - dynamics.residuals))
+    after = after_ends(observed, terminated, start)
+    foreseen = after_ends(basis.features(predicted), ends, start)
+    return after_ends(spread, ends, start), LeaveOneOut(after - own, after - foreseen)
 
 
 def fit_dynamics(
@@ -150,5 +169,5 @@ def fit_dynamics(
         inputs, targets, state_kernel, task, start, rng
     )
     model = KernelEmbedding.fit(kernel, inputs, regulariser)
-    residuals = motion.changes(model.leave_one_out(targets).errors)
-    return Dynamics(motion, model.predictor(targets), residuals), model, x
+    missed = model.leave_one_out(targets).errors
+    return Dynamics(motion, model.predictor(targets), missed), model, x

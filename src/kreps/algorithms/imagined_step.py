@@ -36,7 +36,7 @@ class Outlook:
         rewards: (n,) observed, standardised.
         expect: expected features (m, r) of the successor, of sample numbers (m,) and of their
             states and scaled, applied actions (m, ds + da).
-        reward: what reward (m,) is to be expected of such states and actions, from its mean.
+        reward: what reward (m, 1) is to be expected of such states and actions, from its mean.
     """
 
     states: FloatArray
@@ -94,7 +94,8 @@ def imagine(
     inputs = np.concatenate([states, task.scaled(task.clip(actions))], axis=1)
     # a regression may overshoot what was ever observed, and would be believed
     observed = outlook.rewards
-    rewards = np.clip(observed.mean() + outlook.reward(inputs), observed.min(), observed.max())
+    said = observed.mean() + outlook.reward(inputs)[:, 0]
+    rewards = np.clip(said, observed.min(), observed.max())
     problem = DualProblem(
         rewards=rewards - rewards.max(),
         differences=feature_differences(

@@ -29,10 +29,11 @@ from kreps.algorithms.chunk_sums import (
     StreamedProblem,
     Successors,
 )
-from kreps.algorithms.dynamics import Dynamics, Motion, observed_expectation
+from kreps.algorithms.dynamics import Dynamics, Motion, after_ends, observed_expectation
 from kreps.algorithms.imagined_step import Outlook, imagine
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
+    Expectation,
     PolicySamples,
     UpdateInfo,
     drawn_noise,
@@ -45,6 +46,7 @@ from kreps.algorithms.transition_model import (
     embedding_hyperparameters,
     feature_differences,
     restart_features,
+    reward_regression,
     state_actions,
     state_kernel,
 )
@@ -123,13 +125,23 @@ def update(
     starts = reduce(add, compute.map(StartFeatures(basis, place), dataset.chunks))
     count = int(starts[-1])
     changes = FeatureChanges(basis, starts[:-1] / count, place)
-    here = replace(changes, place=as_float)
-    own, after = here.both(sample)
+    own, observed = replace(changes, place=as_float).observed(sample)
     clock.lap("basis")
 
     # Eq. 4: the expected features of each successor, from features of state and action
     expectation = expected_successors(
-        dataset, sample, changes, own, after, kernel, task, settings, state, compute, rng, clock
+        dataset,
+        sample,
+        changes,
+        own,
+        observed,
+        kernel,
+        task,
+        settings,
+        state.embedding_start,
+        compute,
+        rng,
+        clock,
     )
     errors, embedding_start = expectation.errors, expectation.parameters
     clock.lap("embedding")
@@ -167,7 +179,7 @@ def update(
     )
     x = policy_hyperparameters(support, kernel, settings, state.policy_start, rng)
     clock.lap("policy fit")
-    bases = [basis, *expectation.bases]
+    bases, jitters = [basis, *expectation.bases], [expectation.jitter]
     centres = policy_centres(support, kernel, x, settings, rng)
     policy_sums_of = ChunkPolicySums(centres, task, place)
     policy_sums = reduce(add, compute.map(policy_sums_of, dataset.chunks, dataset.split(weights)))
@@ -177,17 +189,22 @@ def update(
     # the same once more, for other actions in the states of the sample
     reward_start = state.reward_start
     if settings.imagined and expectation.of_actions is not None and seen is not None:
-        reward, reward_start, reward_basis = fit_reward(
-            sample, rewards[sampled], len(sample) / n, kernel, task, settings, reward_start, rng
+        inputs, targets, reward_kernel, regulariser, reward_start = reward_regression(
+            sample, rewards[sampled], kernel, task, reward_start, rng
         )
-        bases.append(reward_basis)
+        embedded = choose_basis(reward_kernel, inputs, settings, settings.rank, rng)
+        bases.append(embedded)
+        # the sample is to say what all samples would, if they were like it
+        reward_sums = RegressionSums.of(embedded.features(inputs), targets)
+        regression = FeatureRegression.fit(embedded, reward_sums, regulariser * len(sample) / n)
+        jitters.append(regression.jitter)
         outlook = Outlook(
             states=sample.states,
             features=own,
             restart=restart,
             rewards=rewards[sampled],
             expect=expectation.of_actions,
-            reward=reward,
+            reward=regression.mean,
         )
         share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
@@ -195,11 +212,9 @@ def update(
         support = PolicySamples.imagined(sample, imagined, dual.weights, task)
         x = policy_hyperparameters(support, kernel, settings, x, rng)
         centres = policy_centres(support, kernel, x, settings, rng)
-        fitted = float(np.exp(x[-1]))
-        drawn = drawn_noise(support, fitted)
-        weights = support.weights * (drawn / fitted)  # as in the exact `fit_policy`
+        weights, noise = drawn_noise(support, float(np.exp(x[-1])))
         policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
-        policy = fit_sparse(task, centres, policy_sums, x, drawn)
+        policy = fit_sparse(task, centres, policy_sums, x, noise)
         clock.lap("imagined step")
     bases.append(centres)
 
@@ -228,9 +243,10 @@ def update(
         state_lengthscales=kernel.lengthscales,
         embedding_parameters=None if embedding_start is None else np.exp(embedding_start),
         policy_parameters=np.exp(x),
+        noise=policy.noise,
         jitter=max(
             dual.jitter,
-            expectation.jitter,
+            *jitters,
             *(chosen.jitter for chosen in bases if isinstance(chosen, RKHSBasis)),
         ),
         seconds=clock.seconds,
@@ -239,26 +255,16 @@ def update(
 
 
 @dataclass(frozen=True)
-class Expectation:
-    """What a transition model says of V's features in the successors of n samples, in low rank.
+class StreamedExpectation(Expectation):
+    """The same of any number of samples; all but these two is of the sample in memory.
 
     Attributes:
-        successors: of the samples of any chunk.
-        expected: (m, r) those of the m samples in memory.
-        errors: of the model on these; None without one.
-        of_actions: as of `kreps.algorithms.reps.Expectation`, for the samples in memory.
-        parameters: log hyper-parameters that the model was fitted with.
+        successors: what is expected of the samples of any chunk.
         bases: features of states and actions, if there is a model.
-        jitter: of its factorisation.
     """
 
     successors: Successors
-    expected: FloatArray
-    errors: LeaveOneOut | None = None
-    of_actions: Callable[[IntArray, FloatArray], FloatArray] | None = None
-    parameters: FloatArray | None = None
-    bases: tuple[Basis, ...] = ()
-    jitter: float = 0.0
+    bases: tuple[Basis, ...]
 
 
 def expected_successors(
@@ -266,100 +272,74 @@ def expected_successors(
     sample: Transitions,
     changes: FeatureChanges,
     own: FloatArray,
-    after: FloatArray,
+    observed: FloatArray,
     state_kernel: Kernel,
     task: TaskSpec,
     settings: Settings,
-    state: LearnerState,
+    start: FloatArray | None,
     compute: Compute,
     rng: np.random.Generator,
     clock: Stopwatch,
-) -> Expectation:
+) -> StreamedExpectation:
     """Fit the transition model that the settings ask for to all samples.
 
     Args:
         dataset, sample: all samples, and the m of them that are in memory.
         changes: features of V.
-        own, after: (m, r) features of V of the sample and of its observed successors.
+        own, observed: (m, r) features of the sample's states and successors.
         state_kernel: its factors are those of the model's kernel.
         task, settings, compute: of the update.
-        state: where the fit starts from.
+        start: log hyper-parameters to start the fit from.
         rng: chooses the samples of the fit.
         clock: of the stages.
     """
+    after = after_ends(observed, sample.terminated[:, None].astype(np.float64), changes.start)
     if settings.model == "sample":
-        return Expectation(ObservedSuccessors(changes), after)
+        return StreamedExpectation(after, None, None, None, 0.0, ObservedSuccessors(changes), ())
     inputs = state_actions(sample, task)
+
+    def regressed(
+        targets: FloatArray, sums_in: Callable[[Basis], Callable[[Chunk], RegressionSums]]
+    ) -> tuple[FeatureRegression, LeaveOneOut, FloatArray, tuple[Basis]]:
+        """A regression of all samples, with hyper-parameters from the targets of the sample."""
+        kernel, regulariser, x = embedding_hyperparameters(
+            inputs, targets, state_kernel, task, start, rng
+        )
+        clock.lap("embedding fit")
+        embedded = choose_basis(kernel, inputs, settings, settings.rank, rng)
+        sums = reduce(add, compute.map(sums_in(embedded), dataset.chunks))
+        errors = FeatureRegression.leave_one_out(
+            embedded.features(inputs), targets, regulariser, len(dataset) / len(sample)
+        )
+        return FeatureRegression.fit(embedded, sums, regulariser), errors, x, (embedded,)
+
+    if settings.model == "dynamics":
+        motion = Motion.of(sample, task)
+        model, missed, x, bases = regressed(
+            motion.targets(sample, task),
+            lambda embedded: MotionSums(motion, embedded, task, changes.place),
+        )
+        dynamics = Dynamics(motion, model.mean, missed.errors)
+        expected, errors = observed_expectation(
+            sample, changes.basis, own, observed, changes.start, dynamics, task
+        )
+        of_actions = partial(dynamics.expected_features, changes.basis, changes.start)
+        successors = PredictedSuccessors(changes, motion, model, task)
+        return StreamedExpectation(expected, errors, of_actions, x, model.jitter, successors, bases)
     from_own = settings.model == "change"
     origin = own if from_own else np.zeros_like(own)
-    motion = Motion.of(sample, task)
-    moves = settings.model == "dynamics"
-    targets = motion.targets(sample, task) if moves else after - origin
-    joint_kernel, regulariser, parameters = embedding_hyperparameters(
-        inputs, targets, state_kernel, task, state.embedding_start, rng
+    model, errors, x, bases = regressed(
+        after - origin, lambda embedded: EmbeddingSums(changes, embedded, task, from_own)
     )
-    clock.lap("embedding fit")
-    embedded = choose_basis(joint_kernel, inputs, settings, settings.rank, rng)
-    sums_of: Callable[[Chunk], RegressionSums] = (
-        MotionSums(motion, embedded, task, changes.place)
-        if moves
-        else EmbeddingSums(changes, embedded, task, from_own)
-    )
-    model = FeatureRegression.fit(
-        embedded, reduce(add, compute.map(sums_of, dataset.chunks)), regulariser
-    )
-    psi = embedded.features(inputs)
-    errors = FeatureRegression.leave_one_out(
-        psi, psi.T @ psi, targets, regulariser, len(dataset) / len(sample)
-    )
-    if moves:
-        dynamics = Dynamics(motion, model.mean, motion.changes(errors.errors))
-        expected, errors = observed_expectation(
-            sample, changes.basis, own, after, dynamics.residuals, task
-        )
-        return Expectation(
-            PredictedSuccessors(changes, motion, model, task),
-            expected,
-            errors,
-            partial(dynamics.expected_features, changes.basis, changes.start),
-            parameters,
-            (embedded,),
-            model.jitter,
-        )
-    return Expectation(
-        EmbeddedSuccessors(changes, model, task, from_own),
+    return StreamedExpectation(
         origin + model.mean(inputs),
         errors,
         lambda rows, asked: origin[rows] + model.mean(asked),
-        parameters,
-        (embedded,),
+        x,
         model.jitter,
+        EmbeddedSuccessors(changes, model, task, from_own),
+        bases,
     )
-
-
-def fit_reward(
-    sample: Transitions,
-    rewards: FloatArray,
-    share: float,
-    state_kernel: Kernel,
-    task: TaskSpec,
-    settings: Settings,
-    start: FloatArray | None,
-    rng: np.random.Generator,
-) -> tuple[Callable[[FloatArray], FloatArray], FloatArray, Basis]:
-    """As `kreps.algorithms.transition_model.fit_reward`, of a sample that is a share of all.
-
-    It says what it would if all samples were like it; the basis is that of the regression.
-    """
-    inputs = state_actions(sample, task)
-    targets = (rewards - rewards.mean())[:, None]
-    kernel, regulariser, x = embedding_hyperparameters(
-        inputs, targets, state_kernel, task, start, rng
-    )
-    basis = choose_basis(kernel, inputs, settings, settings.rank, rng)
-    sums = RegressionSums.of(basis.features(inputs), targets)
-    regression = FeatureRegression.fit(basis, sums, regulariser * share)
-    return lambda asked: regression.mean(asked)[:, 0], x, basis
 
 
 def some(numbers: IntArray, rng: np.random.Generator) -> IntArray:

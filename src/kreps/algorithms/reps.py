@@ -15,9 +15,9 @@ from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
     feature_differences,
     fit_embedding,
-    fit_reward,
     random_rows,
     restart_features,
+    reward_regression,
     state_kernel,
     successor_features,
 )
@@ -76,6 +76,7 @@ class UpdateInfo:
         state_lengthscales: of V's kernel.
         embedding_parameters, policy_parameters: fitted values (not logs): lengthscales, then
             lambda, or sf2 and l.  The former are those of the transition model, whichever it is.
+        noise: variance that actions are drawn with, in units of the action scale squared.
         jitter: largest jitter that a factorisation of this update needed; trial points of the
             hyper-parameter searches do not count.
         seconds: CPU seconds of this process by stage.
@@ -95,6 +96,7 @@ class UpdateInfo:
     state_lengthscales: FloatArray
     embedding_parameters: FloatArray | None
     policy_parameters: FloatArray
+    noise: float
     jitter: float
     seconds: dict[str, float]
 
@@ -145,6 +147,7 @@ def update(
     )
     errors = expectation.errors
     rewards, reward_unit = standardise(data.rewards)
+    jitters = [expectation.jitter]
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
@@ -173,14 +176,18 @@ def update(
     # the same once more, for other actions in these states
     reward_start = state.reward_start
     if settings.imagined and expectation.of_actions is not None:
-        reward, reward_start = fit_reward(data, rewards, kernel, task, reward_start, rng)
+        inputs, targets, reward_kernel, regulariser, reward_start = reward_regression(
+            data, rewards, kernel, task, reward_start, rng
+        )
+        regression = KernelEmbedding.fit(reward_kernel, inputs, regulariser)
+        jitters.append(regression.factor.jitter)
         outlook = Outlook(
             states=data.states,
             features=own,
             restart=restart,
             rewards=rewards,
             expect=expectation.of_actions,
-            reward=reward,
+            reward=regression.predictor(targets),
         )
         imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
         dual = solve_dual(imagined.problem, start=(dual.eta, dual.theta))
@@ -217,11 +224,8 @@ def update(
             None if expectation.parameters is None else np.exp(expectation.parameters)
         ),
         policy_parameters=np.exp(policy_x),
-        jitter=max(
-            dual.jitter,
-            policy.factor.jitter,
-            expectation.jitter,
-        ),
+        noise=policy.noise,
+        jitter=max(dual.jitter, policy.factor.jitter, *jitters),
         seconds=clock.seconds,
     )
     return new_state, info
@@ -281,9 +285,11 @@ def expected_successors(
     if settings.model == "dynamics":
         dynamics, regression, x = fit_dynamics(data, state_kernel, task, start, rng)
         clock.lap("embedding fit")
-        own, after = features[data.state], successor_features(data, features)
-        expected, errors = observed_expectation(data, basis, own, after, dynamics.residuals, task)
+        own, observed = features[data.state], features[data.successor]
         after_end = features[data.start].mean(axis=0)
+        expected, errors = observed_expectation(
+            data, basis, own, observed, after_end, dynamics, task
+        )
         of_actions = partial(dynamics.expected_features, basis, after_end)
         return Expectation(expected, errors, of_actions, x, regression.factor.jitter)
     origin = embedding_origin(data, features, settings)
@@ -447,30 +453,28 @@ def policy_hyperparameters(
     return minimise(loss, prior, centre if start is None else start)
 
 
-def drawn_noise(samples: PolicySamples, fitted: float) -> float:
-    """Noise that actions are drawn with, in units of the action scale squared.
+def drawn_noise(samples: PolicySamples, fitted: float) -> tuple[FloatArray, float]:
+    """Weights (m,) and noise that the policy has, of a fitted noise l.
 
-    The fitted noise l has in it what the mean misses of its targets, which is much where these
-    jump.  Actions are drawn with no more than the weighted actions spread within a state.
+    The fitted noise has in it what the mean misses of its targets, which is much where these jump.
+    Actions are drawn with no more than the weighted actions spread within a state.  Weights shrink
+    along with the noise, so that ``l / w_i``, and with it the mean, stays as fitted.
     """
-    return min(fitted, max(samples.spread, LEAST_NOISE))
+    drawn = min(fitted, max(samples.spread, LEAST_NOISE))
+    return samples.weights * (drawn / fitted), drawn
 
 
 def fit_policy(
     samples: PolicySamples, state_kernel: Kernel, task: TaskSpec, x: FloatArray
 ) -> CostSensitiveGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,).
-
-    Weights shrink along with the noise, so that ``l / w_i``, and with it the mean, stays as fitted.
-    """
-    fitted = float(np.exp(x[-1]))
-    drawn = drawn_noise(samples, fitted)
+    """The policy at log hyper-parameters ``x`` (g + 2,)."""
+    weights, noise = drawn_noise(samples, float(np.exp(x[-1])))
     return CostSensitiveGP(
         task,
         state_kernel.with_lengthscales(np.exp(x[:-2])),
         samples.states,
         samples.targets,
-        samples.weights * (drawn / fitted),
+        weights,
         signal=float(np.exp(x[-2])),
-        noise=drawn,
+        noise=noise,
     )

@@ -5,8 +5,6 @@ And what every step of REPS makes of it: the differences of features, restarts i
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from kreps.arrays import FloatArray, IntArray
@@ -91,9 +89,11 @@ def embedding_hyperparameters(
 ) -> tuple[Kernel, float, FloatArray]:
     """Kernel and regulariser of the embedding by leave-one-out error (Eq. 4), and their logs.
 
+    And of any other regression on states and applied actions: it is the same.
+
     Args:
         inputs: (n, ds + da) states and applied actions.
-        targets: (n, r) features of the observed successors: what is to be predicted.
+        targets: (n, r) what is to be predicted, such as features of the observed successors.
         state_kernel: its factors are those of the embedding's kernel, with other lengthscales.
         task: number of action coordinates.
         start: log hyper-parameters (g + da + 1,) to start the fit from; None for the median.
@@ -136,24 +136,24 @@ def fit_embedding(
     return KernelEmbedding.fit(kernel, inputs, regulariser), x
 
 
-def fit_reward(
+def reward_regression(
     data: Transitions,
     rewards: FloatArray,
     state_kernel: Kernel,
     task: TaskSpec,
     start: FloatArray | None,
     rng: np.random.Generator,
-) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]:
-    """What reward to expect of states and applied actions, from its mean, and log parameters.
+) -> tuple[FloatArray, FloatArray, Kernel, float, FloatArray]:
+    """Inputs (n, ds + da) and targets (n, 1) of a regression of rewards (n,), and how to make it.
 
     A reward may change at once where the dynamics are smooth, so it has a kernel of its own.
 
-    Arguments are those of `embedding_hyperparameters`, with ``rewards`` (n,) as targets.
+    Other arguments, and what is returned beside them, are those of `embedding_hyperparameters`.
     """
     inputs = state_actions(data, task)
     targets = (rewards - rewards.mean())[:, None]
-    kernel, regulariser, x = embedding_hyperparameters(
-        inputs, targets, state_kernel, task, start, rng
+    return (
+        inputs,
+        targets,
+        *embedding_hyperparameters(inputs, targets, state_kernel, task, start, rng),
     )
-    predict = KernelEmbedding.fit(kernel, inputs, regulariser).predictor(targets)
-    return lambda asked: predict(asked)[:, 0], x
