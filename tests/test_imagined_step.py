@@ -26,8 +26,8 @@ from kreps.algorithms.reps import (
 from kreps.algorithms.state import Stopwatch
 from kreps.algorithms.transition_model import (
     feature_differences,
+    fit_embedding,
     restart_features,
-    reward_regression,
     state_actions,
     state_kernel,
 )
@@ -142,10 +142,8 @@ class Case:
             data, basis, features, kernel, TASK, settings, None, rng, Stopwatch()
         )
         rewards, _ = standardise(data.rewards)
-        inputs, targets, reward_kernel, regulariser, _ = reward_regression(
-            data, rewards, kernel, TASK, None, rng
-        )
-        regression = KernelEmbedding.fit(reward_kernel, inputs, regulariser)
+        targets = (rewards - rewards.mean())[:, None]
+        regression, _ = fit_embedding(data, targets, kernel, TASK, None, rng)
         return cls(data, settings, features, rewards, expectation, regression.predictor(targets))
 
     def outlook(self, reward: Callable[[FloatArray], FloatArray] | None = None) -> Outlook:

@@ -104,7 +104,7 @@ class Settings(OnPolicySettings):
             bound go slack instead.  0 leaves only a numerical safeguard of 1e-6.
         ridge: rho times the number of samples; the softness of the stationarity constraint.  None
             takes the mean squared leave-one-out error of the transition model: stationarity is
-            asked for as strictly as successors can be predicted.
+            asked for as strictly as successors can be predicted (but not below 0.001).
         exploring_starts: share of the random restarts that an update plans with in any of the
             sampled states instead of the start states, so that V is learnt beside the way, too;
             roll-outs begin where the environment begins them.

@@ -24,7 +24,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kreps.algorithms.transition_model import embedding_hyperparameters, state_actions
+from kreps.algorithms.transition_model import fit_embedding
 from kreps.arrays import Array, FloatArray, IntArray, like
 from kreps.data import TaskSpec, Transitions
 from kreps.embedding import ROWS, KernelEmbedding, LeaveOneOut
@@ -160,14 +160,10 @@ def fit_dynamics(
 ) -> tuple[Dynamics, KernelEmbedding, FloatArray]:
     """The regression of n transitions, the embedding that makes it, and its log parameters.
 
-    Arguments are those of `kreps.algorithms.transition_model.embedding_hyperparameters`.
+    Arguments are those of `kreps.algorithms.transition_model.fit_embedding`, but for the targets.
     """
     motion = Motion.of(data, task)
     targets = motion.targets(data, task)
-    inputs = state_actions(data, task)
-    kernel, regulariser, x = embedding_hyperparameters(
-        inputs, targets, state_kernel, task, start, rng
-    )
-    model = KernelEmbedding.fit(kernel, inputs, regulariser)
+    model, x = fit_embedding(data, targets, state_kernel, task, start, rng)
     missed = model.leave_one_out(targets).errors
     return Dynamics(motion, model.predictor(targets), missed), model, x

@@ -46,7 +46,6 @@ from kreps.algorithms.transition_model import (
     embedding_hyperparameters,
     feature_differences,
     restart_features,
-    reward_regression,
     state_actions,
     state_kernel,
 )
@@ -189,8 +188,10 @@ def update(
     # the same once more, for other actions in the states of the sample
     reward_start = state.reward_start
     if settings.imagined and expectation.of_actions is not None and seen is not None:
-        inputs, targets, reward_kernel, regulariser, reward_start = reward_regression(
-            sample, rewards[sampled], kernel, task, reward_start, rng
+        inputs = state_actions(sample, task)
+        targets = (rewards[sampled] - rewards[sampled].mean())[:, None]
+        reward_kernel, regulariser, reward_start = embedding_hyperparameters(
+            inputs, targets, kernel, task, reward_start, rng
         )
         embedded = choose_basis(reward_kernel, inputs, settings, settings.rank, rng)
         bases.append(embedded)

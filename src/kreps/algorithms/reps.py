@@ -17,7 +17,6 @@ from kreps.algorithms.transition_model import (
     fit_embedding,
     random_rows,
     restart_features,
-    reward_regression,
     state_kernel,
     successor_features,
 )
@@ -176,10 +175,9 @@ def update(
     # the same once more, for other actions in these states
     reward_start = state.reward_start
     if settings.imagined and expectation.of_actions is not None:
-        inputs, targets, reward_kernel, regulariser, reward_start = reward_regression(
-            data, rewards, kernel, task, reward_start, rng
-        )
-        regression = KernelEmbedding.fit(reward_kernel, inputs, regulariser)
+        # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
+        targets = (rewards - rewards.mean())[:, None]
+        regression, reward_start = fit_embedding(data, targets, kernel, task, reward_start, rng)
         jitters.append(regression.factor.jitter)
         outlook = Outlook(
             states=data.states,

@@ -119,7 +119,7 @@ def embedding_hyperparameters(
 
 def fit_embedding(
     data: Transitions,
-    successors: FloatArray,
+    targets: FloatArray,
     state_kernel: Kernel,
     task: TaskSpec,
     start: FloatArray | None,
@@ -127,33 +127,11 @@ def fit_embedding(
 ) -> tuple[KernelEmbedding, FloatArray]:
     """The embedding (Eq. 4) of n transitions on states and applied actions, and its log parameters.
 
-    Arguments are those of `embedding_hyperparameters`, with (n, r) ``successors`` as targets.
+    Arguments are those of `embedding_hyperparameters`, with (n, r) ``targets``: features of
+    successors, or anything else that is to be regressed.
     """
     inputs = state_actions(data, task)
     kernel, regulariser, x = embedding_hyperparameters(
-        inputs, successors, state_kernel, task, start, rng
+        inputs, targets, state_kernel, task, start, rng
     )
     return KernelEmbedding.fit(kernel, inputs, regulariser), x
-
-
-def reward_regression(
-    data: Transitions,
-    rewards: FloatArray,
-    state_kernel: Kernel,
-    task: TaskSpec,
-    start: FloatArray | None,
-    rng: np.random.Generator,
-) -> tuple[FloatArray, FloatArray, Kernel, float, FloatArray]:
-    """Inputs (n, ds + da) and targets (n, 1) of a regression of rewards (n,), and how to make it.
-
-    A reward may change at once where the dynamics are smooth, so it has a kernel of its own.
-
-    Other arguments, and what is returned beside them, are those of `embedding_hyperparameters`.
-    """
-    inputs = state_actions(data, task)
-    targets = (rewards - rewards.mean())[:, None]
-    return (
-        inputs,
-        targets,
-        *embedding_hyperparameters(inputs, targets, state_kernel, task, start, rng),
-    )
