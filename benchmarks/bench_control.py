@@ -68,8 +68,8 @@ def bench_rollouts(measure: Measure) -> None:
     env = learner.env
 
     def roll_out(policy: StochasticPolicy) -> None:
-        noises = [np.random.default_rng(j) for j in range(ROLLOUTS)]
-        simulate(env, learner.task, policy, range(ROLLOUTS), noises, [STEPS] * ROLLOUTS)
+        noises = [np.random.default_rng(j).standard_normal((STEPS, 1)) for j in range(ROLLOUTS)]
+        simulate(env, learner.task, policy, range(ROLLOUTS), noises)
 
     solved = TriangularSolve(exact)
     states, noise = exact.states[::50], np.ones((30, 1))

@@ -26,9 +26,9 @@ def rollouts(n: int) -> list[Rollout]:
     learner = KREPS(gym.make("kreps/SwingUp-v0"), recipe="observed", seed=SEED)
     assert learner.env is not None
     count = n // STEPS
-    noises = [np.random.default_rng([SEED, j]) for j in range(count)]
+    noises = [np.random.default_rng([SEED, j]).standard_normal((STEPS, 1)) for j in range(count)]
     policy = BangBang(learner.task)
-    return simulate(learner.env, learner.task, policy, range(count), noises, [STEPS] * count)
+    return simulate(learner.env, learner.task, policy, range(count), noises)
 
 
 def bench_update_from_many(measure: Measure) -> None:

@@ -181,8 +181,8 @@ def make_data(folder: Path, n: int, steps: int = 50) -> None:
     parts = []
     for first in range(0, count, at_once):
         seeds = range(first, min(first + at_once, count))
-        noise = [np.random.default_rng([1, j]) for j in seeds]
-        parts += simulate(env, task, policy, seeds, noise, [steps] * len(seeds))
+        noise = [np.random.default_rng([1, j]).standard_normal((steps, 1)) for j in seeds]
+        parts += simulate(env, task, policy, seeds, noise)
     np.save(folder / "observations.npy", np.concatenate([r.observations for r in parts]))
     np.save(folder / "actions.npy", np.concatenate([r.actions for r in parts]))
     np.save(folder / "rewards.npy", np.concatenate([r.rewards for r in parts]))

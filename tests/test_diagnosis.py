@@ -61,6 +61,7 @@ HEALTHY: dict[str, Any] = {
     "policy_noise": 0.4,
     "max_rank": 400,
     "ridge": 0.02,
+    "exploring": 0.0,
 }
 
 
@@ -392,7 +393,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         ridge=0.03,
         seconds={},
     )
-    learner: Any = SimpleNamespace(settings=Settings(max_rank=70))
+    learner: Any = SimpleNamespace(settings=Settings(max_rank=70), exploring=True)
     told: Any = SimpleNamespace(
         iteration=1, rollouts=30, steps=1000, average_reward=-1.0, update=info, rollout_seconds=0.1
     )
@@ -400,7 +401,15 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
     assert set(row) == set(COLUMNS) and row["weighted"] == 4000
     assert row["policy_noise"] == pytest.approx(0.3) and row["max_rank"] == 70
     assert row["clipped"] == 0.25 and row["eta_floor"] == 0.1 and np.isnan(row["model_error"])
-    assert row["ridge"] == 0.03
+    assert row["ridge"] == 0.03 and row["exploring"] == 1.0
+
+
+def test_a_goal_that_was_not_reached_is_the_limit() -> None:
+    found = {f.name: f for f in diagnose(rows(exploring=1.0))}["goal"]
+    assert found.severity == "limit" and found.value == 12
+    assert "price of the actions" in found.sentence and "update(rollouts)" in found.remedy
+    for fine in ([1.0] * 5 + [0.0] * 7, float("nan")):
+        assert "goal" not in {f.name for f in diagnose(rows(exploring=fine))}
 
 
 @pytest.mark.parametrize("settings", [{"features": "grid"}, {"approximation": "fourier"}])
@@ -482,7 +491,7 @@ def test_every_panel_is_marked_with_its_gravest_finding(changes: dict[str, Any])
         gravest = min(mine, key=["limit", "note", "fine"].index)
         assert axes.get_title(loc="right") == f"● {gravest}"
     shown = {name for names in diagnosis_page.PANELS.values() for name in names}
-    assert shown == CAUSES
+    assert shown == CAUSES | {"goal"}
 
 
 @pytest.mark.parametrize("changes", [{}, BAD], ids=["healthy", "bad"])

@@ -267,8 +267,9 @@ def test_rollouts_in_batches_and_step_by_step_agree() -> None:
             return 3.0 * noise
 
     def rollouts(form: gym.Env[Any, Any]) -> list[kreps.Rollout]:
-        noises = [np.random.default_rng(j) for j in range(3)]
-        return simulate(form, task, Noise(), [1, 2, 3], noises, [7, 3, 9])
+        rng = np.random.default_rng(0)
+        noises = [rng.standard_normal((length, 2)) for length in (7, 3, 9)]
+        return simulate(form, task, Noise(), [1, 2, 3], noises)
 
     wrapped: gym.Env[Any, Any] = gym.Wrapper(env)
     assert batch_model_of(wrapped) is None

@@ -175,6 +175,7 @@ def diagnose(
     references = references or {}
     found = [
         updates(rows),
+        goal(rows),
         local_optimum(rows, evaluation, references),
         progress(rows, evaluation, references),
         step(rows),
@@ -242,6 +243,23 @@ def updates(rows: Sequence[Row]) -> Finding:
 
 
 # ---- the reward -------------------------------------------------------------------------------
+
+
+def goal(rows: Sequence[Row]) -> Finding | None:
+    """Whether any reward tells of the states; None if it does, or if that was not recorded."""
+    told = column(rows, "exploring")
+    if not told[-1] > 0.0:
+        return None
+    return Finding(
+        "goal",
+        "limit",
+        float(np.sum(told > 0.0)),
+        0.0,
+        "The rewards of the kept roll-outs are constant, or a price of the actions alone: no goal "
+        "was reached, and there is nothing to learn from. Roll-outs explore until there is.",
+        "more of them (kreps resume RUN --iterations 20), or longer ones (--set "
+        "restart_probability=0.01); from Python, update(rollouts) with some that reach the goal.",
+    )
 
 
 def reward_of(rows: Sequence[Row], evaluation: Mapping[str, Any] | None) -> float:

@@ -58,8 +58,10 @@ def evaluation_rollouts(
         task,
         policy,
         [integer_seed(seed, Purpose.EVALUATION_ENVIRONMENT, j) for j in range(episodes)],
-        [generator(seed, Purpose.EVALUATION_POLICY, j) for j in range(episodes)],
-        [steps] * episodes,
+        [
+            generator(seed, Purpose.EVALUATION_POLICY, j).standard_normal((steps, task.action_size))
+            for j in range(episodes)
+        ],
     )
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
@@ -16,7 +16,6 @@ import numpy as np
 
 from kreps import storage
 from kreps.algorithms import low_rank_reps, npalp, reps, value_iteration
-from kreps.algorithms.rare_states import rewarded_by_rarity
 from kreps.algorithms.state import LearnerState, UpdateReport
 from kreps.arrays import FloatArray
 from kreps.compute import Compute
@@ -24,6 +23,7 @@ from kreps.controller import Policy
 from kreps.data import Rollout, TaskSpec, Window
 from kreps.dataset import Dataset
 from kreps.errors import ConfigurationError, DataError
+from kreps.exploration import PINK, RED, WHITE, tells_of_states
 from kreps.policies import MAX_SUPPORT, BangBang, Gaussian, StochasticPolicy
 from kreps.rollout import Environment, collect, collect_grid, task_of, without_restarts
 from kreps.seeding import Purpose, generator
@@ -143,6 +143,14 @@ class Learner(Generic[MethodSettings]):
             f"<{type(self).__name__} seed {self.seed}: {state.iteration} updates from "
             f"{state.rollouts} roll-outs ({state.steps} steps)>"
         )
+
+    @property
+    def exploring(self) -> bool:
+        """Whether the next roll-outs explore, whatever was learnt: no reward tells of the states.
+
+        Only learners that collect by their own policy do so.
+        """
+        return False
 
     @property
     def policy(self) -> Policy:
@@ -306,15 +314,16 @@ class OnPolicyLearner(Learner[OnPolicy]):
     """A learner that explores by its own stochastic policy, from start states only (Sec. 4.1)."""
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
-        settings = self.settings
+        policy, exponent = self._acting()
         return collect(
             env,
             self.task,
-            self._acting_policy(),
+            policy,
             self._batch(),
             seed=self.seed,
             iteration=self.state.iteration,
-            restart_probability=settings.restart_probability,
+            restart_probability=self.settings.restart_probability,
+            exponent=exponent,
             on_rollout=on_rollout,
         )
 
@@ -323,12 +332,21 @@ class OnPolicyLearner(Learner[OnPolicy]):
         first = self.state.iteration == 0
         return self.settings.initial_rollouts if first else self.settings.rollouts_per_iteration
 
-    def _acting_policy(self) -> StochasticPolicy:
+    @property
+    def exploring(self) -> bool:
+        kept = self.state.window.rollouts
+        return bool(kept) and not tells_of_states(kept, self.task)
+
+    def _acting(self) -> tuple[StochasticPolicy, float]:
+        """The policy of the next roll-outs, and the exponent of its noise's spectrum."""
+        if self.exploring:
+            return BangBang(self.task), RED
         if self.state.policy is not None:
-            return self.state.policy
+            return self.state.policy, WHITE
         if self.settings.exploration == "bang-bang":
-            return BangBang(self.task)
-        return Gaussian(self.task, self.settings.exploration_scale)
+            return BangBang(self.task), WHITE
+        gaussian = Gaussian(self.task, self.settings.exploration_scale)
+        return gaussian, PINK if self.settings.exploration == "pink" else WHITE
 
 
 class KREPS(OnPolicyLearner[Settings]):
@@ -396,39 +414,19 @@ class KREPS(OnPolicyLearner[Settings]):
             )
         return info
 
-    @property
-    def _seeks(self) -> bool:
-        return self.settings.exploration == "seeking"
-
-    def _batch(self) -> int:
-        return self.settings.rollouts_per_iteration if self._seeks else super()._batch()
-
     def _updated(
         self, rollouts: list[Rollout], rng: np.random.Generator
     ) -> tuple[LearnerState, UpdateReport]:
-        seen = self.state.rollouts + len(rollouts)
-        if not self._seeks or seen >= self.settings.initial_rollouts:
-            return self._learnt(self.state, rollouts, rng)
-        # an update like any other, but the roll-outs are kept with the rewards that they have
-        window = self.state.extended_window(rollouts, self.task)
-        told = rewarded_by_rarity(window, self.task, rng)
-        old, new = told[: -len(rollouts)], told[-len(rollouts) :]
-        before = replace(self.state, window=Window(window.capacity, tuple(old)))
-        learnt, info = self._learnt(before, new, rng)
-        after = self.state.after(rollouts, window)
-        return replace(learnt, window=window, rollouts=after.rollouts, steps=after.steps), info
-
-    def _learnt(
-        self, state: LearnerState, rollouts: list[Rollout], rng: np.random.Generator
-    ) -> tuple[LearnerState, UpdateReport]:
-        samples = sum(map(len, state.window.extend(rollouts).rollouts))
+        samples = sum(map(len, self.state.window.extend(rollouts).rollouts))
         if not low_rank_reps.applies(self.settings, samples):
-            return type(self).algorithm(state, rollouts, self.task, self.settings, rng)
-        return low_rank_reps.update(state, rollouts, self.task, self.settings, rng, self.compute)
+            return super()._updated(rollouts, rng)
+        return low_rank_reps.update(
+            self.state, rollouts, self.task, self.settings, rng, self.compute
+        )
 
     @property
     def value_function(self) -> LinearFunction:
-        """V of the last update (Eq. 3), in units of the reward (of rarity while it is sought).
+        """V of the last update (Eq. 3), in units of the reward.
 
         Raises:
             ConfigurationError: nothing has been learnt yet.

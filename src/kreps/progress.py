@@ -72,6 +72,8 @@ class ProgressTable:
             self._stages[name] = self._stages.get(name, 0.0) + seconds
         shown = report.update.shown()
         note = shown.pop("note", "")
+        if learner.exploring:
+            note = "no reward tells of the states yet: exploring"
         row = {
             "iter": f"{report.iteration}",
             "steps": f"{report.steps}",

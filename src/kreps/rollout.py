@@ -16,6 +16,7 @@ from kreps.data import LARGEST, Rollout, TaskSpec, is_sane
 from kreps.envs.batch import BatchModel, SettableModel
 from kreps.envs.restart import RandomRestart, restart_length
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
+from kreps.exploration import WHITE, coloured_noise
 from kreps.policies import StochasticPolicy
 from kreps.seeding import Purpose, generator, integer_seed
 
@@ -101,11 +102,13 @@ def collect(
     seed: int,
     iteration: int,
     restart_probability: float,
+    exponent: float = WHITE,
     on_rollout: Callable[[int], None] | None = None,
 ) -> list[Rollout]:
     """``count`` roll-outs of random length, as the paper's protocol collects them.
 
     Args:
+        exponent: of the spectrum of the policy's noise (`kreps.exploration.coloured_noise`).
         on_rollout: called with the number of roll-outs that are complete.
 
     Raises:
@@ -113,9 +116,13 @@ def collect(
         DataError: it returned NaN, infinities or observations of another size.
     """
     seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
-    noises = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
+    rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
     lengths = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
-    return simulate(env, task, policy, seeds, noises, lengths, on_rollout)
+    noises = [
+        coloured_noise(exponent, length, task.action_size, rng)
+        for length, rng in zip(lengths, rngs, strict=True)
+    ]
+    return simulate(env, task, policy, seeds, noises, on_rollout)
 
 
 def collect_grid(
@@ -210,20 +217,19 @@ def simulate(
     task: TaskSpec,
     policy: StochasticPolicy,
     seeds: Sequence[int],
-    noises: Sequence[np.random.Generator],
-    lengths: Sequence[int],
+    noises: Sequence[FloatArray],
     on_rollout: Callable[[int], None] | None = None,
 ) -> list[Rollout]:
-    """One roll-out per seed, of at most the given length, with the policy's noise as given."""
+    """One roll-out per seed, with the policy's noise as given, (length, da) each, and as long."""
     model = batch_model_of(env)
     if model is not None:
-        rollouts = _simulate_batch(model, task, policy, seeds, noises, lengths)
+        rollouts = _simulate_batch(model, task, policy, seeds, noises)
         if on_rollout is not None:
             on_rollout(len(rollouts))
         return rollouts
     rollouts = []
-    for number, (seed, noise, length) in enumerate(zip(seeds, noises, lengths, strict=True)):
-        rollouts.append(_simulate_one(env, task, policy, seed, noise, length, number))
+    for number, (seed, noise) in enumerate(zip(seeds, noises, strict=True)):
+        rollouts.append(_simulate_one(env, task, policy, seed, noise, number))
         if on_rollout is not None:
             on_rollout(number + 1)
     return rollouts
@@ -234,11 +240,10 @@ def _simulate_batch(
     task: TaskSpec,
     policy: StochasticPolicy,
     seeds: Sequence[int],
-    noises: Sequence[np.random.Generator],
-    lengths: Sequence[int],
+    noises: Sequence[FloatArray],
 ) -> list[Rollout]:
     rngs = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
-    ends = np.array(lengths)  # shortened where a roll-out really ends
+    ends = np.array([len(noise) for noise in noises])  # shortened where a roll-out really ends
     terminated = np.zeros(len(ends), dtype=bool)
     longest = int(ends.max())
     observations = np.empty((longest + 1, len(ends), task.observation_size))
@@ -252,7 +257,7 @@ def _simulate_batch(
             live = np.flatnonzero(ends > t)
             if len(live) == 0:
                 break
-            noise = np.array([noises[int(j)].standard_normal(task.action_size) for j in live])
+            noise = np.stack([noises[int(j)][t] for j in live])
             actions[t, live] = policy.act(observations[t, live], noise)
             states[live], rewards[t, live], done = model.step(
                 states[live], task.clip(actions[t, live]), [rngs[int(j)] for j in live]
@@ -275,8 +280,7 @@ def _simulate_one(
     task: TaskSpec,
     policy: StochasticPolicy,
     seed: int,
-    noise: np.random.Generator,
-    length: int,
+    noise: FloatArray,
     number: int,
 ) -> Rollout:
     space = env.action_space
@@ -287,9 +291,9 @@ def _simulate_one(
     try:
         observation, _ = env.reset(seed=seed)
         observations.append(_state(observation, task))
-        while not (terminated or truncated) and len(rewards) < length:
+        while not (terminated or truncated) and len(rewards) < len(noise):
             state = observations[-1]
-            action = policy.act(state[None], noise.standard_normal((1, task.action_size)))[0]
+            action = policy.act(state[None], noise[len(actions)][None])[0]
             applied = task.clip(action).astype(space.dtype).reshape(space.shape or ())
             observation, reward, terminated, truncated, _ = env.step(applied)
             observations.append(_state(observation, task))

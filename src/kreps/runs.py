@@ -49,6 +49,7 @@ NEWER = (
     "policy_noise",
     "max_rank",
     "ridge",
+    "exploring",
 )
 """Columns that runs of earlier versions have not.  There they are NaN, as is the error where there
 is no model, and the cap where the features of V are of a fixed number."""
@@ -264,5 +265,6 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "policy_noise": math.sqrt(info.noise),
         "max_rank": rank_cap(learner.settings),
         "ridge": info.ridge,
+        "exploring": float(learner.exploring),
         **{f"cpu_seconds_{s.replace(' ', '_')}": round(seconds.get(s, 0.0), 5) for s in STAGES},
     }

@@ -14,8 +14,7 @@ Model = Literal["dynamics", "change", "embedding", "sample"]
 Approximation = Literal["auto", "exact", "pivoted", "uniform", "fourier"]
 Features = Literal["rkhs", "grid"]
 PolicyFit = Literal["map", "bounded"]
-Noise = Literal["bang-bang", "gaussian"]
-Exploration = Literal[Noise, "seeking"]
+Exploration = Literal["bang-bang", "gaussian", "pink"]
 
 
 @dataclass(frozen=True)
@@ -67,17 +66,13 @@ class OnPolicySettings(LearnerSettings):
     A roll-out lasts (1 - p) / p steps on expectation.  Beside `LearnerSettings`:
 
     Attributes:
-        exploration: first policy, ``"bang-bang"`` (limits with random sign) or ``"gaussian"``;
-            KREPS also knows ``"seeking"``: a Gaussian one for the first ``rollouts_per_iteration``
-            of the initial roll-outs, then updates that seek rare states instead of reward.  Until
-            there are ``initial_rollouts``, policy and V know nothing of the reward.
-        exploration_scale: standard deviation of the Gaussian one, in units of half the range.
-        initial_rollouts: roll-outs before the reward is learnt from.
-        rollouts_per_iteration: roll-outs of the current policy before each later update.
+        exploration: first policy, ``"bang-bang"`` (limits with random sign), ``"gaussian"`` or
+            ``"pink"``, a Gaussian one with noise that has slow parts as well as fast ones.
+        exploration_scale: standard deviation of the Gaussian ones, in units of half the range.
+        initial_rollouts: roll-outs before the first update.
+        rollouts_per_iteration: roll-outs before each later one, of the current policy; or at the
+            limits with slow noise while no reward tells of the states.
     """
-
-    explorations: ClassVar[Any] = Noise
-    """The choices of ``exploration``."""
 
     exploration: Exploration = "bang-bang"
     exploration_scale: float = 1.0
@@ -86,7 +81,7 @@ class OnPolicySettings(LearnerSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._choose("exploration", self.explorations)
+        self._choose("exploration", Exploration)
         self._positive("exploration_scale")
         self._whole("initial_rollouts", "rollouts_per_iteration")
 
@@ -128,8 +123,6 @@ class Settings(OnPolicySettings):
             approximated; V has ``max_rank``.
     """
 
-    explorations: ClassVar[Any] = Exploration
-
     kl_bound: float = 1.0
     eta_floor: float = 0.05
     ridge: float | None = None
@@ -157,13 +150,6 @@ class Settings(OnPolicySettings):
         self._check("exploring_starts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
         self._check("imagined", Integral, "a whole number >= 0", lambda v: v >= 0)
         self._whole("max_rank", "grid_size", "rank")
-        if self.exploration == "seeking" and self.rollouts_per_iteration >= self.initial_rollouts:
-            raise ConfigurationError(
-                f'exploration = "seeking" with initial_rollouts = {self.initial_rollouts} and '
-                f"rollouts_per_iteration = {self.rollouts_per_iteration}, but it seeks "
-                "after the first batch and before there are all initial roll-outs; "
-                'ask for more of them, for smaller batches or for exploration="gaussian"'
-            )
         if self.model == "sample" and (self.imagined or self.ridge is None):
             raise ConfigurationError(
                 f'model = "sample" with imagined = {self.imagined} and ridge = {self.ridge}, but '

@@ -195,8 +195,8 @@ def draw_features(path: Path) -> Path:
     env = gym.make("kreps/ImageSwingUp-v0")
     task = task_of(env)
     seeds = [integer_seed(0, Purpose.ENVIRONMENT, 0, 0)]
-    noise = [generator(0, Purpose.POLICY, 0, 0)]
-    (rollout,) = simulate(env, task, BangBang(task), seeds, noise, [41])
+    noise = [generator(0, Purpose.POLICY, 0, 0).standard_normal((41, task.action_size))]
+    (rollout,) = simulate(env, task, BangBang(task), seeds, noise)
     shown = np.arange(1, 41, 5)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure = plotting.image_features(

@@ -52,8 +52,8 @@ TASKS: dict[str, Task] = {
     "swing-up, Gaussian start": Task(
         "kreps/SwingUp-v0", 17, {"exploration": "gaussian"}, episodes=EPISODES
     ),
-    "swing-up, seeking": Task(
-        "kreps/SwingUp-v0", 19, {"exploration": "seeking"}, episodes=EPISODES
+    "swing-up, pink noise": Task(
+        "kreps/SwingUp-v0", 17, {"exploration": "pink"}, episodes=EPISODES
     ),
     "reaching, own start": Task("kreps/Reaching-v0", 15, episodes=50),
     "images, long": Task("kreps/ImageSwingUp-v0", 17, episodes=50),
@@ -149,7 +149,7 @@ BEYOND: dict[str, tuple[Curve, ...]] = {
         for task in (
             "swing-up, long",
             "swing-up, Gaussian start",
-            "swing-up, seeking",
+            "swing-up, pink noise",
             "reaching, own start",
             "images, long",
             "pendulum",

@@ -1,0 +1,173 @@
+"""What is explored with before the reward tells of the states: coloured noise, and for how long."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import kreps
+from kreps.data import Rollout, TaskSpec
+from kreps.exploration import PINK, RED, WHITE, coloured_noise, tells_of_states
+
+TASK = TaskSpec(2, np.array([-2.0, -1.0]), np.array([2.0, 1.0]))
+
+
+@pytest.mark.parametrize("exponent", [PINK, RED])
+def test_coloured_noise_is_standard_normal(exponent: float) -> None:
+    rng = np.random.default_rng(0)
+    draws = np.stack([coloured_noise(exponent, 40, 2, rng) for _ in range(4000)])
+    assert draws.shape == (4000, 40, 2)
+    np.testing.assert_allclose(draws.mean(axis=0), 0.0, atol=0.08)
+    np.testing.assert_allclose(draws.std(axis=0), 1.0, atol=0.06)
+    tails = np.mean(np.abs(draws) > 1.96)
+    assert tails == pytest.approx(0.05, abs=0.005)
+    assert abs(np.mean(draws[..., 0] * draws[..., 1])) < 0.02
+
+
+@pytest.mark.parametrize("exponent", [PINK, RED])
+def test_its_spectrum_falls_as_it_should(exponent: float) -> None:
+    rng = np.random.default_rng(1)
+    length = 256
+    draws = np.stack([coloured_noise(exponent, length, 1, rng)[:, 0] for _ in range(3000)])
+    windowed = draws * np.hanning(length)  # the first and the last of a roll-out do not meet
+    power = np.mean(np.abs(np.fft.rfft(windowed, axis=1)) ** 2, axis=0)
+    k = np.array([8, 16, 32, 64])
+    slope = np.polyfit(np.log(k), np.log(power[k]), 1)[0]
+    assert slope == pytest.approx(-exponent, abs=0.1)
+
+
+def test_the_end_of_a_roll_out_is_no_neighbour_of_its_beginning() -> None:
+    rng = np.random.default_rng(2)
+    draws = np.stack([coloured_noise(RED, 50, 1, rng)[:, 0] for _ in range(4000)])
+    assert np.mean(draws[:, 0] * draws[:, 1]) > 0.9
+    assert np.mean(draws[:, 0] * draws[:, -1]) < 0.0  # half a period away
+
+
+def test_white_noise_is_what_the_generator_draws() -> None:
+    found = coloured_noise(WHITE, 7, 3, np.random.default_rng(3))
+    rng = np.random.default_rng(3)
+    np.testing.assert_array_equal(found, np.stack([rng.standard_normal(3) for _ in range(7)]))
+
+
+def test_a_single_step_has_noise_too() -> None:
+    assert np.isfinite(coloured_noise(PINK, 1, 2, np.random.default_rng(4))).all()
+
+
+def rollout(reward: Any, seed: int = 0, steps: int = 30) -> Rollout:
+    """Random commands, some beyond the limits; ``reward(states, applied actions)``."""
+    rng = np.random.default_rng(seed)
+    states = rng.standard_normal((steps + 1, 2))
+    actions = 2.0 * rng.standard_normal((steps, 2))
+    return Rollout(states, actions, reward(states[:-1], TASK.clip(actions)))
+
+
+@pytest.mark.parametrize(
+    "reward",
+    [
+        lambda s, a: np.zeros(len(s)),
+        lambda s, a: np.full(len(s), -1.0),
+        lambda s, a: -0.1 * a[:, 0] ** 2,
+        lambda s, a: 3.0 - a[:, 0] ** 2 - 0.2 * (a[:, 1] - a[:, 0]) ** 2 + a[:, 1],
+    ],
+)
+def test_constants_and_prices_of_actions_tell_nothing(reward: Any) -> None:
+    assert not tells_of_states([rollout(reward, seed) for seed in range(3)], TASK)
+
+
+@pytest.mark.parametrize(
+    "reward",
+    [
+        lambda s, a: -(s[:, 0] ** 2),
+        lambda s, a: -(s[:, 0] ** 2) - a[:, 0] ** 2,
+        lambda s, a: -0.1 * a[:, 0] ** 2 + 100.0 * (np.arange(len(s)) == 17),  # a goal, once
+    ],
+)
+def test_what_depends_on_states_tells(reward: Any) -> None:
+    assert tells_of_states([rollout(reward, seed) for seed in range(3)], TASK)
+
+
+@pytest.mark.parametrize("name", ["kreps/SwingUp-v0", "kreps/Reaching-v0", "Pendulum-v1"])
+def test_one_roll_out_of_a_dense_reward_tells(name: str) -> None:
+    learner = kreps.KREPS(gym.make(name), initial_rollouts=1, rollouts_per_iteration=1)
+    learner.learn(1, progress=False)
+    assert tells_of_states(learner.state.window.rollouts, learner.task)
+
+
+TINY: dict[str, Any] = {"initial_rollouts": 4, "rollouts_per_iteration": 2, "window": 4}
+
+
+@pytest.mark.parametrize("method", [kreps.KREPS, kreps.ValueIteration, kreps.NPALP])
+def test_slow_noise_at_the_limits_until_the_reward_tells(method: Any) -> None:
+    learner = method(gym.make("MountainCarContinuous-v0"), seed=1, **TINY)
+    assert not learner.exploring  # its first policy is its own
+    learner.learn(2, progress=False)
+    assert learner.exploring
+    newest = learner.state.window.rollouts[2:]  # of the second iteration
+    np.testing.assert_array_equal(np.abs(np.concatenate([r.actions for r in newest])), 1.0)
+    longest = max(newest, key=len)
+    assert np.mean(longest.actions[1:] == longest.actions[:-1]) > 0.8  # white noise: one half
+
+
+def test_a_goal_seen_once_is_learnt_from() -> None:
+    learner = kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **TINY)
+    learner.learn(1, progress=False)
+    seen = learner.state.window.rollouts[0]
+    rewards = np.where(np.arange(len(seen)) == len(seen) - 1, 100.0, seen.rewards)
+    learner.update([Rollout(seen.observations, seen.actions, rewards, terminated=True)])
+    assert not learner.exploring
+    learner.learn(1, progress=False)
+    actions = np.concatenate([r.actions for r in learner.state.window.rollouts[-2:]])
+    assert (np.abs(actions) != 1.0).any()  # it is the policy that acts
+
+
+def test_the_progress_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **TINY).learn(1)
+    assert "no reward tells of the states yet" in capsys.readouterr().out
+
+
+def test_pink_noise_brings_the_rod_nearer_to_the_top_than_white_noise() -> None:
+    def at_the_top(exploration: str) -> float:
+        """Share of the states of four seeds that are near upright."""
+        shares = []
+        for seed in (161, 162, 163, 164):
+            env = gym.make("kreps/SwingUp-v0")
+            learner = kreps.KREPS(env, seed=seed, exploration=exploration)
+            learner.learn(1, progress=False)
+            angles = [r.observations[:, 0] for r in learner.state.window.rollouts]
+            shares.append(float(np.mean(np.abs(np.concatenate(angles)) < 0.5)))
+        return float(np.mean(shares))
+
+    assert at_the_top("pink") > 2.0 * at_the_top("gaussian")
+
+
+def test_first_roll_outs_are_as_the_seed_says() -> None:
+    def actions() -> np.ndarray:
+        learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=5, exploration="pink", **TINY)
+        learner.learn(1, progress=False)
+        return np.concatenate([r.actions for r in learner.state.window.rollouts])
+
+    np.testing.assert_array_equal(actions(), actions())
+
+
+def test_the_share_of_clipped_actions_is_of_the_new_roll_outs() -> None:
+    rng = np.random.default_rng(4)
+
+    def fresh(scale: float) -> Rollout:
+        return Rollout(rng.standard_normal((9, 2)), np.full((8, 1), scale), np.zeros(8))
+
+    learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]), **TINY)
+    assert learner.update([fresh(0.5)]).clipped == 0.0
+    assert learner.update([fresh(2.0)]).clipped == 1.0
+
+
+def test_a_batch_larger_than_the_window_is_counted_whole() -> None:
+    rng = np.random.default_rng(5)
+    batch = [Rollout(rng.standard_normal((9, 2)), np.zeros((8, 1)), np.zeros(8)) for _ in "abc"]
+    learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]), **(TINY | {"window": 2}))
+    info = learner.update(batch)
+    assert info.samples == 16
+    assert (learner.state.rollouts, learner.state.steps) == (3, 24)
+    assert learner.state.window.rollouts == tuple(batch[1:])
