@@ -11,6 +11,7 @@ from kreps.algorithms.dynamics import (
     Dynamics,
     Motion,
     fit_dynamics,
+    linear_trend,
     observed_expectation,
     state_changes,
 )
@@ -66,6 +67,34 @@ def test_coordinates_that_share_a_lengthscale_share_a_unit() -> None:
     targets = motion.targets(data, task)
     np.testing.assert_array_equal(targets[:, -1], [0.0, 1.0])
     np.testing.assert_allclose(motion.changes(targets), state_changes(data, task))
+    assert not motion.slopes.any()  # two samples are too few for a trend
+
+
+def test_what_is_linear_is_left_to_the_trend() -> None:
+    data = pushes(20)
+    motion = Motion.of(data, TASK)
+    assert np.abs(motion.targets(data, TASK)).max() < 1e-4
+    # and goes on as a line where no sample ever was
+    inputs = np.array([[50.0, 40.0, 1.0]])
+    np.testing.assert_allclose(
+        motion.changes(motion.trend(inputs)), [[0.3 * 36.6, -4.0 + 0.6]], rtol=1e-4
+    )
+
+
+def test_the_trend_is_not_in_angles_nor_in_ends() -> None:
+    task = TaskSpec(2, np.array([-2.0]), np.array([2.0]), periodic=(0,))
+    slopes = Motion.of(pushes(20, ended=True), task).slopes
+    assert not slopes[1].any()
+    assert not slopes[:, -1].any()
+    assert slopes[2:, :-1].all()
+
+
+def test_a_coordinate_that_never_changes_has_no_slope() -> None:
+    rng = np.random.default_rng(0)
+    inputs = np.column_stack([rng.normal(size=50), np.full(50, 0.1) * 3.0])
+    slopes = linear_trend(inputs, 2.0 * inputs[:, :1] + 1.0, ())
+    np.testing.assert_allclose(slopes, [[1.0], [2.0], [0.0]], atol=1e-5)
+    assert not linear_trend(inputs[:19], inputs[:19], ()).any()  # ten for each of two coefficients
 
 
 def test_without_noise_it_says_where_any_action_leads() -> None:
@@ -96,6 +125,7 @@ def test_of_the_taken_actions_it_expects_the_observed_and_its_mirror_image() -> 
         rest = np.arange(len(data)) != i
         refit = type(model).fit(model.kernel, model.inputs[rest], model.regulariser)
         said = refit.strengths(model.inputs[i : i + 1])[:, 0] @ targets[rest]
+        said += dynamics.motion.trend(model.inputs[i : i + 1])[0]
         predicted = data.states[i] + dynamics.motion.changes(said[None])
         mirrored = 2.0 * predicted - data.points[data.successor[i]]
         np.testing.assert_allclose(
@@ -211,6 +241,7 @@ def test_chunks_are_told_of_the_observed_and_its_mirror_image(ended: bool) -> No
     own, expected = PredictedSuccessors(changes, dynamics.motion, regression, TASK)(data)
     np.testing.assert_allclose(own, features[data.state], atol=1e-8)
     said = model.expected_features(dynamics.motion.targets(data, TASK))
+    said += dynamics.motion.trend(state_actions(data, TASK))
     predicted = data.states + dynamics.motion.changes(said)
     mirrored = basis.features(2.0 * predicted - data.points[data.successor])
     spread = 0.5 * (features[data.successor] + mirrored)

@@ -189,7 +189,8 @@ class PredictedSuccessors:
     def __call__(self, data: Transitions) -> tuple[Array, Array]:
         place = self.changes.place
         own, observed = self.changes.observed(data)
-        targets = self.model.mean(place(state_actions(data, self.task)))
+        inputs = place(state_actions(data, self.task))
+        targets = self.motion.trend(inputs) + self.model.mean(inputs)
         away = place(data.states - state_changes(data, self.task))
         mirrored = self.changes.basis.features(2.0 * self.motion.changes(targets) + away)
         ends = namespace(targets).clip(targets[:, -1:], 0.0, 1.0)

@@ -18,13 +18,13 @@ observed successor and its mirror image in the predicted one.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from kreps.algorithms.transition_model import fit_embedding
+from kreps.algorithms.transition_model import fit_embedding, state_actions
 from kreps.arrays import Array, FloatArray, IntArray, like
 from kreps.data import TaskSpec, Transitions
 from kreps.embedding import ROWS, KernelEmbedding, LeaveOneOut
@@ -44,34 +44,75 @@ ROUNDING = 1e-12
 """Changes below this share of a coordinate's size are none: its rounding is not to be learnt."""
 
 
+TREND_SAMPLES = 10
+"""Least number of samples for each coefficient of a trend; with fewer there is none."""
+
+TREND_RIDGE = 1e-6
+"""Of a trend's least squares, a sample, for coordinates of unit variance: as good as none."""
+
+
 @dataclass(frozen=True)
 class Motion:
-    """What is regressed: changes of state, and whether the task ended, as numbers of order one.
+    """What is regressed: changes of state as numbers of order one, less a trend; and real ends.
+
+    A kernel regression fades to nothing far from the data and follows a slope only where samples
+    are dense.  But most of what moves a mechanism is a slope: a position changes with the velocity,
+    a velocity with the force.  So a straight line in all coordinates but angles goes first.
 
     Attributes:
         unit: (ds,) root mean square change, one for all coordinates that share a lengthscale.
+        slopes: (1 + ds + da, ds + 1) of the trend: its constant, then those of states and actions.
     """
 
     unit: FloatArray
+    slopes: FloatArray
 
     @classmethod
     def of(cls, data: Transitions, task: TaskSpec) -> Motion:
         unit = np.ones(task.observation_size)
-        squares = np.mean(state_changes(data, task) ** 2, axis=0)
+        changes = state_changes(data, task)
+        squares = np.mean(changes**2, axis=0)
         for factor in task.state_factors:
             columns = list(factor.dims)
             size = np.sqrt(np.mean(squares[columns]))
             if size > ROUNDING * np.abs(data.points[:, columns]).max():
                 unit[columns] = size
-        return cls(unit)
+        slopes = linear_trend(state_actions(data, task), changes / unit, task.periodic)
+        return cls(unit, np.column_stack([slopes, np.zeros(len(slopes))]))
 
     def targets(self, data: Transitions, task: TaskSpec) -> FloatArray:
         """What is regressed of n transitions, (n, ds + 1)."""
-        return np.column_stack([state_changes(data, task) / self.unit, data.terminated])
+        whole = np.column_stack([state_changes(data, task) / self.unit, data.terminated])
+        return whole - self.trend(state_actions(data, task))
+
+    def trend(self, inputs: Array) -> Array:
+        """What is not regressed, (n, ds + 1), of states and applied actions (n, ds + da)."""
+        slopes = like(self.slopes, inputs)
+        return inputs @ slopes[1:] + slopes[0]
 
     def changes(self, targets: Array) -> Array:
-        """Changes of state (n, ds) of targets (n, ds + 1)."""
+        """Changes of state (n, ds) of targets and trend together (n, ds + 1)."""
         return targets[:, :-1] * like(self.unit, targets)
+
+
+def linear_trend(inputs: FloatArray, targets: FloatArray, left_out: Iterable[int]) -> FloatArray:
+    """Constant and slopes (1 + d, k) of targets (n, k) as linear functions of inputs (n, d).
+
+    Zero where there are too few samples, and for the columns left out and those that never change.
+    """
+    slopes = np.zeros((1 + inputs.shape[1], targets.shape[1]))
+    deviation = inputs.std(axis=0)
+    moving = deviation > ROUNDING * np.abs(inputs).max(axis=0)
+    moving[list(left_out)] = False
+    if len(inputs) < TREND_SAMPLES * (1 + np.count_nonzero(moving)):
+        return slopes
+    centre = inputs[:, moving].mean(axis=0)
+    z = (inputs[:, moving] - centre) / deviation[moving]
+    normal = z.T @ z + TREND_RIDGE * len(z) * np.eye(z.shape[1])
+    found = np.linalg.solve(normal, z.T @ (targets - targets.mean(axis=0)))
+    slopes[1:][moving] = found / deviation[moving][:, None]
+    slopes[0] = targets.mean(axis=0) - centre @ slopes[1:][moving]
+    return slopes
 
 
 def after_ends(features: Array, ends: Array, start: FloatArray) -> Array:
@@ -85,7 +126,8 @@ class Dynamics:
 
     Attributes:
         motion: units of what is regressed.
-        predict: its targets (m, ds + 1) of states and scaled, applied actions (m, ds + da).
+        predict: its targets (m, ds + 1) of states and scaled, applied actions (m, ds + da), but for
+            the trend.
         missed: (n, ds + 1) targets of n samples less what all others predict of them.
     """
 
@@ -113,7 +155,7 @@ class Dynamics:
         width = self.residuals.shape[1]
         for first in range(0, len(rows), ROWS):
             block = slice(first, first + ROWS)
-            targets = self.predict(inputs[block])
+            targets = self.motion.trend(inputs[block]) + self.predict(inputs[block])
             successors = inputs[block, :width] + self.motion.changes(targets)
             residuals = self.residuals[rows[block]]
             spread = 0.5 * basis.features(successors + residuals)
