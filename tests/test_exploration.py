@@ -89,6 +89,14 @@ def test_what_depends_on_states_tells(reward: Any) -> None:
     assert tells_of_states([rollout(reward, seed) for seed in range(3)], TASK)
 
 
+def test_with_fewer_samples_than_terms_anything_but_a_constant_tells() -> None:
+    def of(reward: Any) -> Rollout:
+        return rollout(reward, steps=6)  # two actions have six terms
+
+    assert tells_of_states([of(lambda s, a: s[:, 0])], TASK)
+    assert not tells_of_states([of(lambda s, a: np.ones(len(s)))], TASK)
+
+
 @pytest.mark.parametrize("name", ["kreps/SwingUp-v0", "kreps/Reaching-v0", "Pendulum-v1"])
 def test_one_roll_out_of_a_dense_reward_tells(name: str) -> None:
     learner = kreps.KREPS(gym.make(name), initial_rollouts=1, rollouts_per_iteration=1)

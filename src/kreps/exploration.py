@@ -50,5 +50,7 @@ def tells_of_states(rollouts: Sequence[Rollout], task: TaskSpec) -> bool:
     actions = task.scaled(task.clip(np.concatenate([rollout.actions for rollout in rollouts])))
     i, j = np.triu_indices(task.action_size)
     terms = np.column_stack([np.ones(len(actions)), actions, actions[:, i] * actions[:, j]])
+    if len(terms) <= terms.shape[1]:  # anything can be made of so many actions
+        terms = terms[:, :1]
     missed = rewards - terms @ np.linalg.lstsq(terms, rewards)[0]
     return bool(np.abs(missed).max() > UNTOLD * np.abs(rewards).max())

@@ -58,7 +58,7 @@ TASKS: dict[str, Task] = {
     "reaching, own start": Task("kreps/Reaching-v0", 15, episodes=50),
     "images, long": Task("kreps/ImageSwingUp-v0", 17, episodes=50),
     "pendulum": Task("Pendulum-v1", 15, episodes=20),
-    "mountain-car": Task("MountainCarContinuous-v0", 15),
+    "mountain-car": Task("MountainCarContinuous-v0", 18, episodes=50),
 }
 
 
