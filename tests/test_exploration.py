@@ -70,7 +70,8 @@ def rollout(reward: Any, seed: int = 0, steps: int = 30) -> Rollout:
         lambda s, a: np.zeros(len(s)),
         lambda s, a: np.full(len(s), -1.0),
         lambda s, a: -0.1 * a[:, 0] ** 2,
-        lambda s, a: 3.0 - a[:, 0] ** 2 - 0.2 * (a[:, 1] - a[:, 0]) ** 2 + a[:, 1],
+        lambda s, a: 3.0 - a[:, 0] ** 2 - 0.2 * (a[:, 1] - a[:, 0]) ** 2,
+        lambda s, a: (-0.1 * a[:, 0] ** 2).astype(np.float32),
     ],
 )
 def test_constants_and_prices_of_actions_tell_nothing(reward: Any) -> None:
@@ -83,6 +84,8 @@ def test_constants_and_prices_of_actions_tell_nothing(reward: Any) -> None:
         lambda s, a: -(s[:, 0] ** 2),
         lambda s, a: -(s[:, 0] ** 2) - a[:, 0] ** 2,
         lambda s, a: -0.1 * a[:, 0] ** 2 + 100.0 * (np.arange(len(s)) == 17),  # a goal, once
+        lambda s, a: 1e6 + s[:, 0],
+        lambda s, a: -((a[:, 0] - 0.5) ** 2),  # of actions alone, but to do nothing is not best
     ],
 )
 def test_what_depends_on_states_tells(reward: Any) -> None:
@@ -133,7 +136,7 @@ def test_a_goal_seen_once_is_learnt_from() -> None:
 
 def test_the_progress_says_so(capsys: pytest.CaptureFixture[str]) -> None:
     kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **TINY).learn(1)
-    assert "no reward tells of the states yet" in capsys.readouterr().out
+    assert "no reward tells of the states: exploring" in capsys.readouterr().out
 
 
 def test_pink_noise_brings_the_rod_nearer_to_the_top_than_white_noise() -> None:

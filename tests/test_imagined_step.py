@@ -12,6 +12,7 @@ import pytest
 
 import kreps
 from kreps.algorithms import imagined_step, low_rank_reps, reps, transition_model
+from kreps.algorithms.dynamics import Motion
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine, resample
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
@@ -299,8 +300,9 @@ def test_the_ridge_is_the_error_of_refits_without_each_sample(model: Any) -> Non
     if model == "change":
         errors = errors_of_refits(embedding, targets)
     else:
-        missed = errors_of_refits(embedding, data.points[data.successor] - data.states)
-        predicted = basis.features(data.points[data.successor] - missed)
+        motion = Motion.of(data, TASK)
+        missed = errors_of_refits(embedding, motion.targets(data, TASK))
+        predicted = basis.features(data.points[data.successor] - motion.changes(missed))
         errors = features[data.successor] - predicted
     assert info.ridge == pytest.approx(np.mean(np.sum(errors**2, axis=1)), rel=1e-6)
     assert info.ridge > 5.0 * RIDGE_LEAST

@@ -255,10 +255,11 @@ def goal(rows: Sequence[Row]) -> Finding | None:
         "limit",
         float(np.sum(told > 0.0)),
         0.0,
-        "The rewards of the kept roll-outs are constant, or a price of the actions alone: no goal "
-        "was reached, and there is nothing to learn from. Roll-outs explore until there is.",
-        "more of them (kreps resume RUN --iterations 20), or longer ones (--set "
-        "restart_probability=0.01); from Python, update(rollouts) with some that reach the goal.",
+        "The rewards of the kept roll-outs are constant, or a price of the actions: no goal in "
+        "sight, they say that to do nothing is best. Roll-outs explore meanwhile.",
+        f"more of them (kreps resume RUN --iterations {2 * len(rows)}), or a new run with longer "
+        "ones (--set restart_probability=0.01); from Python, update(rollouts) with some that reach "
+        "the goal.",
     )
 
 

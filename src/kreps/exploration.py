@@ -18,8 +18,8 @@ from kreps.data import Rollout, TaskSpec
 WHITE, PINK, RED = 0.0, 1.0, 2.0
 """Exponents beta of the spectrum."""
 
-UNTOLD = 1e-6
-"""Largest part of the largest reward that rounding leaves where the reward is of actions alone."""
+UNTOLD = 2e-7
+"""Part of the largest reward that is none: what 32-bit numbers lose in a sum or a product."""
 
 
 def coloured_noise(
@@ -41,16 +41,26 @@ def coloured_noise(
 
 
 def tells_of_states(rollouts: Sequence[Rollout], task: TaskSpec) -> bool:
-    """Whether the rewards of some roll-outs depend on more than the actions.
+    """Whether the rewards of some roll-outs depend on more than a price of the actions.
 
-    A goal that was never reached is a constant, and what else there is may be a price of the
-    actions, quadratic as it mostly is.  Learnt from, it says that standing still is best.
+    A goal that was never reached is a constant, and what else there is may be what actions cost,
+    quadratic as it mostly is.  Learnt from, it says that to do nothing is best.
     """
     rewards = np.concatenate([rollout.rewards for rollout in rollouts])
+    least = UNTOLD * np.abs(rewards).max()
+    if np.ptp(rewards) <= least:
+        return False
     actions = task.scaled(task.clip(np.concatenate([rollout.actions for rollout in rollouts])))
-    i, j = np.triu_indices(task.action_size)
-    terms = np.column_stack([np.ones(len(actions)), actions, actions[:, i] * actions[:, j]])
-    if len(terms) <= terms.shape[1]:  # anything can be made of so many actions
-        terms = terms[:, :1]
-    missed = rewards - terms @ np.linalg.lstsq(terms, rewards)[0]
-    return bool(np.abs(missed).max() > UNTOLD * np.abs(rewards).max())
+    idle = task.scaled(task.clip(np.zeros((1, task.action_size))))
+    terms, of_idle = quadratic_terms(actions), quadratic_terms(idle)
+    if len(terms) <= terms.shape[1]:  # anything can be made of so many
+        return True
+    price = np.linalg.lstsq(terms, rewards)[0]
+    exact = np.abs(rewards - terms @ price).max() <= least
+    return not (exact and rewards.max() <= of_idle @ price + least)
+
+
+def quadratic_terms(actions: FloatArray) -> FloatArray:
+    """One, each coordinate of actions (n, da), and each product of two of them."""
+    i, j = np.triu_indices(actions.shape[1])
+    return np.column_stack([np.ones(len(actions)), actions, actions[:, i] * actions[:, j]])

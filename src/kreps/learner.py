@@ -148,7 +148,8 @@ class Learner(Generic[MethodSettings]):
     def exploring(self) -> bool:
         """Whether the next roll-outs explore, whatever was learnt: no reward tells of the states.
 
-        Only learners that collect by their own policy do so.
+        Only learners that collect by their own policy do so.  Roll-outs of the window are asked,
+        data sets are not.
         """
         return False
 

@@ -73,7 +73,7 @@ class ProgressTable:
         shown = report.update.shown()
         note = shown.pop("note", "")
         if learner.exploring:
-            note = "no reward tells of the states yet: exploring"
+            note = f"{note}  no reward tells of the states: exploring".strip()
         row = {
             "iter": f"{report.iteration}",
             "steps": f"{report.steps}",

@@ -173,9 +173,10 @@ class RunFolder:
                 reader = csv.DictReader(file)
                 rows = list(reader)
                 columns = tuple(reader.fieldnames or ())
-                if columns == COLUMNS[: -len(NEWER)]:
-                    rows = [{**row, **dict.fromkeys(NEWER, "nan")} for row in rows]
-                elif columns != COLUMNS:
+                if len(columns) >= len(COLUMNS) - len(NEWER) and columns == COLUMNS[: len(columns)]:
+                    missing = dict.fromkeys(COLUMNS[len(columns) :], "nan")
+                    rows = [{**row, **missing} for row in rows]
+                else:
                     raise ValueError("its columns are not those of a run")
                 for row in rows:
                     if row["outcome"] not in Outcome.__members__:

@@ -18,7 +18,7 @@ observed successor and its mirror image in the predicted one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -48,7 +48,11 @@ TREND_SAMPLES = 10
 """Least number of samples for each coefficient of a trend; with fewer there is none."""
 
 TREND_RIDGE = 1e-6
-"""Of a trend's least squares, a sample, for coordinates of unit variance: as good as none."""
+"""Of a trend's least squares, a sample, for states of unit variance: as good as none."""
+
+ACTION_RIDGE = 1.0
+"""The same in all, for actions in units of their scale: those that hardly differed in the data say
+nothing of how a whole range of them would act, which is what will be asked."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +61,8 @@ class Motion:
 
     A kernel regression fades to nothing far from the data and follows a slope only where samples
     are dense.  But most of what moves a mechanism is a slope: a position changes with the velocity,
-    a velocity with the force.  So a straight line in all coordinates but angles goes first.
+    a velocity with the force.  So a straight line in all coordinates but angles goes first; it is
+    of all samples, the one that is left out elsewhere among them.
 
     Attributes:
         unit: (ds,) root mean square change, one for all coordinates that share a lengthscale.
@@ -77,7 +82,7 @@ class Motion:
             size = np.sqrt(np.mean(squares[columns]))
             if size > ROUNDING * np.abs(data.points[:, columns]).max():
                 unit[columns] = size
-        slopes = linear_trend(state_actions(data, task), changes / unit, task.periodic)
+        slopes = linear_trend(state_actions(data, task), changes / unit, task)
         return cls(unit, np.column_stack([slopes, np.zeros(len(slopes))]))
 
     def targets(self, data: Transitions, task: TaskSpec) -> FloatArray:
@@ -88,30 +93,31 @@ class Motion:
     def trend(self, inputs: Array) -> Array:
         """What is not regressed, (n, ds + 1), of states and applied actions (n, ds + da)."""
         slopes = like(self.slopes, inputs)
-        return inputs @ slopes[1:] + slopes[0]
+        return inputs @ slopes[1:, :] + slopes[0, :]
 
     def changes(self, targets: Array) -> Array:
         """Changes of state (n, ds) of targets and trend together (n, ds + 1)."""
         return targets[:, :-1] * like(self.unit, targets)
 
 
-def linear_trend(inputs: FloatArray, targets: FloatArray, left_out: Iterable[int]) -> FloatArray:
+def linear_trend(inputs: FloatArray, targets: FloatArray, task: TaskSpec) -> FloatArray:
     """Constant and slopes (1 + d, k) of targets (n, k) as linear functions of inputs (n, d).
 
-    Zero where there are too few samples, and for the columns left out and those that never change.
+    Zero for angles and for what never changes, and all of them where there are too few samples.
     """
     slopes = np.zeros((1 + inputs.shape[1], targets.shape[1]))
-    deviation = inputs.std(axis=0)
-    moving = deviation > ROUNDING * np.abs(inputs).max(axis=0)
-    moving[list(left_out)] = False
-    if len(inputs) < TREND_SAMPLES * (1 + np.count_nonzero(moving)):
+    unit = inputs.std(axis=0)
+    used = unit > ROUNDING * np.abs(inputs).max(axis=0)
+    used[list(task.periodic)] = False
+    if len(inputs) < TREND_SAMPLES * (1 + np.count_nonzero(used)):
         return slopes
-    centre = inputs[:, moving].mean(axis=0)
-    z = (inputs[:, moving] - centre) / deviation[moving]
-    normal = z.T @ z + TREND_RIDGE * len(z) * np.eye(z.shape[1])
-    found = np.linalg.solve(normal, z.T @ (targets - targets.mean(axis=0)))
-    slopes[1:][moving] = found / deviation[moving][:, None]
-    slopes[0] = targets.mean(axis=0) - centre @ slopes[1:][moving]
+    ridge = np.full(inputs.shape[1], TREND_RIDGE * len(inputs))
+    unit[task.observation_size :], ridge[task.observation_size :] = 1.0, ACTION_RIDGE
+    centre = inputs[:, used].mean(axis=0)
+    z = (inputs[:, used] - centre) / unit[used]
+    product = z.T @ (targets - targets.mean(axis=0))
+    slopes[1:][used] = np.linalg.solve(z.T @ z + np.diag(ridge[used]), product) / unit[used, None]
+    slopes[0] = targets.mean(axis=0) - centre @ slopes[1:][used]
     return slopes
 
 
