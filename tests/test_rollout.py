@@ -16,6 +16,7 @@ from kreps.data import Rollout, TaskSpec
 from kreps.envs.swing_up import SwingUp
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
 from kreps.evaluation import discounted_average
+from kreps.exploration import RED
 from kreps.policies import BangBang, StochasticPolicy
 from kreps.rollout import batch_model_of, collect, simulate, task_of, without_restarts
 from kreps.seeding import Purpose, generator, integer_seed
@@ -237,6 +238,18 @@ def test_truncation_by_a_time_limit_is_no_real_end() -> None:
     rollouts = collected(env, Linear(1.0), probability=0.01)
     assert max(len(r) for r in rollouts) == 4
     assert not any(r.terminated for r in rollouts)
+
+
+def test_noise_is_drawn_for_no_more_steps_than_the_environment_allows() -> None:
+    env = gym.make("Pendulum-v1")  # cut off after 200 steps
+    task = task_of(env)
+    options: dict[str, Any] = {"seed": 0, "iteration": 0, "restart_probability": 1e-9}
+    (rollout,) = collect(env, task, BangBang(task), 1, **options, exponent=RED)
+    assert len(rollout) == 200
+    held = np.mean(rollout.actions[1:] == rollout.actions[:-1])
+    assert (
+        held < 0.999
+    )  # the slowest part of its noise is that of 200 steps, not of a thousand million
 
 
 def test_real_ends_in_a_batch_stop_their_own_rollout_only() -> None:

@@ -5,6 +5,7 @@ Both ways address their randomness by roll-out, so they give the same data from 
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any, cast
 
@@ -93,6 +94,16 @@ def batch_model_of(env: Environment) -> BatchModel | None:
     return None
 
 
+def time_limit(env: Environment) -> int:
+    """Steps after which a wrapper cuts the environment off, so far as its spec tells."""
+    while isinstance(env, gym.Wrapper):
+        limit = env.spec.max_episode_steps if env.spec is not None else None
+        if isinstance(env, gym.wrappers.TimeLimit) and limit is not None:
+            return int(limit)
+        env = env.env
+    return sys.maxsize
+
+
 def collect(
     env: Environment,
     task: TaskSpec,
@@ -117,7 +128,9 @@ def collect(
     """
     seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
     rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
-    lengths = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
+    limit = time_limit(env)
+    drawn = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
+    lengths = [min(length, limit) for length in drawn]
     noises = [
         coloured_noise(exponent, length, task.action_size, rng)
         for length, rng in zip(lengths, rngs, strict=True)
