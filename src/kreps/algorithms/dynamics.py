@@ -1,9 +1,9 @@
 """The transition model of the default recipe: where a state moves to, and how far that may be off.
 
 Eq. 4 learns what becomes of each feature of V by itself, hundreds of them, though all are functions
-of one successor.  Here the change of the state is what is regressed (with the machinery of Eq. 4:
-the same kernel over states and actions, the same leave-one-out fit), and V's features are taken at
-the successor that it predicts.
+of one successor.  Here the change of the state is what is regressed: a linear trend first, then
+what it leaves (with the machinery of Eq. 4: the same kernel over states and actions, the same
+leave-one-out fit).  V's features are taken at the successor that both predict.
 
 Features at a predicted successor are not yet expected features: noise is missing, and a V that
 knows nothing of noise will be fitted to it.  What the regression of all other samples misses of a
