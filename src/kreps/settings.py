@@ -106,9 +106,9 @@ class Settings(OnPolicySettings):
         imagined: actions per state that are drawn anew for a second bounded step, in which the
             model says what they lead to; 0 leaves that step out.
         model: transition model: ``"dynamics"`` regresses how the state changes, after a linear
-            trend, and takes the features of V where that leads; ``"change"`` embeds how the features change, so that
-            far from the data the state stays; ``"embedding"`` embeds the successor itself, as
-            printed (Eq. 4); ``"sample"`` takes the observed successor.
+            trend, and takes the features of V where that leads; ``"change"`` embeds how the
+            features change, so that far from the data the state stays; ``"embedding"`` embeds the
+            successor itself, as printed (Eq. 4); ``"sample"`` takes the observed successor.
         features: of V, ``"rkhs"`` (Eq. 3) or ``"grid"`` (fixed radial basis functions).
         grid_size: centres per coordinate of the grid.
         policy_fit: hyper-parameters of the policy by leave-one-out density, ``"map"`` with priors
