@@ -527,3 +527,24 @@ def test_settings_can_be_given_whole() -> None:
     task = kreps.TaskSpec(2, [-1.0], [1.0])
     assert kreps.KREPS(task, recipe=settings).settings == settings
     assert kreps.KREPS(task, recipe=settings, window=9).settings.window == 9
+
+
+def test_the_share_of_clipped_actions_is_of_the_new_roll_outs() -> None:
+    rng = np.random.default_rng(4)
+
+    def fresh(scale: float) -> Rollout:
+        return Rollout(rng.standard_normal((9, 2)), np.full((8, 1), scale), np.zeros(8))
+
+    learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]), window=4)
+    assert learner.update([fresh(0.5)]).clipped == 0.0
+    assert learner.update([fresh(2.0)]).clipped == 1.0
+
+
+def test_a_batch_larger_than_the_window_is_counted_whole() -> None:
+    rng = np.random.default_rng(5)
+    batch = [Rollout(rng.standard_normal((9, 2)), np.zeros((8, 1)), np.zeros(8)) for _ in "abc"]
+    learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]), window=2)
+    info = learner.update(batch)
+    assert info.samples == 16
+    assert (learner.state.rollouts, learner.state.steps) == (3, 24)
+    assert learner.state.window.rollouts == tuple(batch[1:])

@@ -51,7 +51,7 @@ def as_numpy(array: Array) -> FloatArray:
     return as_float(np.from_dlpack(array, device="cpu"))
 
 
-def columns(array: Array, chosen: Sequence[int]) -> Array:
+def columns(array: Array, chosen: Sequence[int] | IntArray) -> Array:
     """``array[:, chosen]``."""
     if isinstance(array, np.ndarray):
         return array[:, chosen]

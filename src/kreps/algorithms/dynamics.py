@@ -25,7 +25,7 @@ from functools import cached_property
 import numpy as np
 
 from kreps.algorithms.transition_model import fit_embedding, state_actions
-from kreps.arrays import Array, FloatArray, IntArray, like
+from kreps.arrays import Array, FloatArray, IntArray, columns, like
 from kreps.data import TaskSpec, Transitions
 from kreps.embedding import ROWS, KernelEmbedding, LeaveOneOut
 from kreps.kernels import Kernel
@@ -42,7 +42,6 @@ def state_changes(data: Transitions, task: TaskSpec) -> FloatArray:
 
 ROUNDING = 1e-12
 """Changes below this share of a coordinate's size are none: its rounding is not to be learnt."""
-
 
 TREND_SAMPLES = 10
 """Least number of samples for each coefficient of a trend; with fewer there is none."""
@@ -78,10 +77,10 @@ class Motion:
         changes = state_changes(data, task)
         squares = np.mean(changes**2, axis=0)
         for factor in task.state_factors:
-            columns = list(factor.dims)
-            size = np.sqrt(np.mean(squares[columns]))
-            if size > ROUNDING * np.abs(data.points[:, columns]).max():
-                unit[columns] = size
+            dims = list(factor.dims)
+            size = np.sqrt(np.mean(squares[dims]))
+            if size > ROUNDING * np.abs(data.points[:, dims]).max():
+                unit[dims] = size
         slopes = linear_trend(state_actions(data, task), changes / unit, task)
         return cls(unit, np.column_stack([slopes, np.zeros(len(slopes))]))
 
@@ -92,8 +91,9 @@ class Motion:
 
     def trend(self, inputs: Array) -> Array:
         """What is not regressed, (n, ds + 1), of states and applied actions (n, ds + da)."""
-        slopes = like(self.slopes, inputs)
-        return inputs @ slopes[1:, :] + slopes[0, :]
+        used = np.flatnonzero(self.slopes[1:].any(axis=1))  # of 800 pixels mostly none
+        slopes = self.slopes[1:][used]
+        return columns(inputs, used) @ like(slopes, inputs) + like(self.slopes[0], inputs)
 
     def changes(self, targets: Array) -> Array:
         """Changes of state (n, ds) of targets and trend together (n, ds + 1)."""
