@@ -13,6 +13,7 @@ import pytest
 import kreps
 from kreps.algorithms import imagined_step, low_rank_reps, reps, transition_model
 from kreps.algorithms.dynamics import Motion
+from kreps.algorithms.imagined_rollouts import Simulator
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine, resample
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
@@ -41,6 +42,7 @@ from kreps.hyperparameters import Prior, minimise
 from kreps.kernels import Kernel, SquaredExponential
 from kreps.policies import StochasticPolicy
 from kreps.settings import Settings, settings_of
+from kreps.value import Basis
 
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
 
@@ -127,10 +129,12 @@ class Case:
 
     data: Transitions
     settings: Settings
+    basis: Basis
     features: FloatArray
     rewards: FloatArray
     expectation: reps.Expectation
     reward: Callable[[FloatArray], FloatArray]
+    simulator: Simulator | None = None
 
     @classmethod
     def of(cls, **changes: Any) -> Case:
@@ -145,13 +149,15 @@ class Case:
         rewards, _ = standardise(data.rewards)
         targets = (rewards - rewards.mean())[:, None]
         regression, _ = fit_embedding(data, targets, kernel, TASK, None, rng)
-        return cls(data, settings, features, rewards, expectation, regression.predictor(targets))
+        reward = regression.predictor(targets)
+        return cls(data, settings, basis, features, rewards, expectation, reward)
 
     def outlook(self, reward: Callable[[FloatArray], FloatArray] | None = None) -> Outlook:
         assert self.expectation.of_actions is not None
         return Outlook(
             states=self.data.states,
             features=self.features[self.data.state],
+            features_at=self.basis.features,
             restart=restart_features(
                 self.features[self.data.start].mean(axis=0),
                 self.features[self.data.state].mean(axis=0),
@@ -160,6 +166,7 @@ class Case:
             rewards=self.rewards,
             expect=self.expectation.of_actions,
             reward=self.reward if reward is None else reward,
+            simulator=self.simulator,
         )
 
     def imagined(
@@ -183,7 +190,7 @@ def test_of_the_observed_actions_the_model_says_what_the_first_step_was_told(mod
     case = Case.of(model=model)
     data = case.data
     found = case.imagined(Given(data.actions), imagined=1)
-    np.testing.assert_array_equal(found.rows, np.arange(len(data)))
+    np.testing.assert_array_equal(found.states[found.of], data.states)
     np.testing.assert_array_equal(found.actions, data.actions)
     p = case.settings.restart_probability
     outlook = case.outlook()
@@ -213,9 +220,9 @@ def test_actions_are_drawn_in_the_states_of_the_weights() -> None:
     weights[[3, 11]] = 0.25, 0.75
     policy = Given(np.zeros((2 * n, 1)))
     found = case.imagined(policy, weights)
-    np.testing.assert_array_equal(np.bincount(found.rows)[[3, 11]], [n // 2, 3 * n // 2])
-    assert policy.states is not None
-    np.testing.assert_array_equal(policy.states, case.data.states[found.rows])
+    np.testing.assert_array_equal(found.states, case.data.states[[3, 11]])
+    np.testing.assert_array_equal(np.bincount(found.of), [n // 2, 3 * n // 2])
+    np.testing.assert_array_equal(policy.states, found.states[found.of])
 
 
 def test_the_model_is_asked_about_the_applied_actions_and_the_commanded_ones_are_kept() -> None:
@@ -260,7 +267,7 @@ def test_no_more_is_imagined_than_fits_in_memory(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(imagined_step, "MOST_IMAGINED", 37)
     case = Case.of(imagined=4)
     found = case.imagined(Given(np.zeros((37, 1))))
-    assert len(found.rows) == len(found.actions) == len(found.problem.rewards) == 37
+    assert len(found.of) == len(found.actions) == len(found.problem.rewards) == 37
     assert found.problem.differences.shape == (37, case.features.shape[1])
     assert found.problem.ridge == pytest.approx(0.3 / 37)
     _, info = updated(pushes())
@@ -353,7 +360,8 @@ def test_targets_are_the_weighted_means_of_the_actions_of_each_state() -> None:
     p[::7] = 1e-9
     p /= p.sum()
     nothing = DualProblem(np.zeros(60), np.zeros((60, 1)), 1.0, 1.0, 1.0)
-    found = PolicySamples.imagined(data, ImaginedSamples(rows, actions, nothing), p, task)
+    imagined = ImaginedSamples(data.states, rows, actions, nothing)
+    found = PolicySamples.imagined(imagined, p, task)
 
     scaled = (actions - [0.0, 5.0]) / [2.0, 5.0]
     w = p * effective_sample_size(p)
@@ -379,7 +387,7 @@ def test_of_one_action_in_each_state_nothing_is_lost() -> None:
     nothing = DualProblem(np.zeros(n), np.zeros((n, 1)), 1.0, 1.0, 1.0)
     wanted = PolicySamples.of(data, p, TASK)
     found = PolicySamples.imagined(
-        data, ImaginedSamples(np.arange(n), data.actions, nothing), p, TASK
+        ImaginedSamples(data.states, np.arange(n), data.actions, nothing), p, TASK
     )
     for name, value in vars(wanted).items():
         np.testing.assert_allclose(getattr(found, name), value, atol=1e-14)
@@ -547,7 +555,7 @@ def test_the_second_fit_of_the_policy_starts_from_the_first(
 
 
 def test_the_support_is_at_most_one_point_for_each_state() -> None:
-    learner, info = updated(pushes(), imagined=20)
+    learner, info = updated(pushes(), imagined=20, imagined_rollouts=0.0)
     assert len(info.dual.weights) == 20 * 120
     assert 30 < info.support <= 120
     assert info.support == len(learner.policy.process.states)
@@ -563,11 +571,12 @@ def test_the_spread_of_actions_within_a_state_is_unbiased() -> None:
     actions = 2.0 * rng.normal(0.0, 0.3, size=(n * each, 1)) + 5.0 * data.states[rows, :1]
     problem = DualProblem(np.zeros(n * each), np.zeros((n * each, 1)), 1.0, 1.0, 0.1)
     p = np.full(n * each, 1.0 / (n * each))
-    samples = PolicySamples.imagined(data, ImaginedSamples(rows, actions, problem), p, TASK)
+    imagined = ImaginedSamples(data.states, rows, actions, problem)
+    samples = PolicySamples.imagined(imagined, p, TASK)
     assert samples.spread == pytest.approx(0.09, rel=0.05)  # in units of half the range
     assert np.mean(samples.within) == pytest.approx(0.06, rel=0.05)
-    alone = ImaginedSamples(np.arange(n), actions[:n], problem)
-    assert PolicySamples.imagined(data, alone, p[:n], TASK).spread == np.inf
+    alone = ImaginedSamples(data.states, np.arange(n), actions[:n], problem)
+    assert PolicySamples.imagined(alone, p[:n], TASK).spread == np.inf
     assert PolicySamples.of(data, p[:n], TASK).spread == np.inf
 
 

@@ -105,6 +105,8 @@ class Settings(OnPolicySettings):
             roll-outs begin where the environment begins them.
         imagined: actions per state that are drawn anew for a second bounded step, in which the
             model says what they lead to; 0 leaves that step out.
+        imagined_rollouts: share of these actions in states that the policy is led to in roll-outs
+            simulated by the model ``"dynamics"``, the others in sampled states; none in images.
         model: transition model: ``"dynamics"`` regresses how the state changes, after a linear
             trend, and takes the features of V where that leads; ``"change"`` embeds how the
             features change, so that far from the data the state stays; ``"embedding"`` embeds the
@@ -128,6 +130,7 @@ class Settings(OnPolicySettings):
     ridge: float | None = None
     exploring_starts: float = 0.25
     imagined: int = 4
+    imagined_rollouts: float = 0.5
     model: Model = "dynamics"
     features: Features = "rkhs"
     grid_size: int = 10
@@ -148,6 +151,7 @@ class Settings(OnPolicySettings):
             self._check("ridge", Real, "positive and finite, or None", lambda v: 0 < v < inf)
         self._check("eta_floor", Real, "finite and >= 0", lambda v: 0 <= v < inf)
         self._check("exploring_starts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
+        self._check("imagined_rollouts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
         self._check("imagined", Integral, "a whole number >= 0", lambda v: v >= 0)
         self._whole("max_rank", "grid_size", "rank")
         if self.model == "sample" and (self.imagined or self.ridge is None):

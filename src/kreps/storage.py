@@ -72,7 +72,9 @@ CHECKPOINT_ARRAYS = (
         "start.reward",
     }
 )
-ADDED_LATER: dict[str, dict[str, Any]] = {"reps": {"imagined": 0, "exploring_starts": 0.0}}
+ADDED_LATER: dict[str, dict[str, Any]] = {
+    "reps": {"imagined": 0, "exploring_starts": 0.0, "imagined_rollouts": 0.0}
+}
 """Settings by method that earlier checkpoints have not, at the values that mean what these did."""
 
 ARRAYS = {"policy": POLICY_ARRAYS, "rollouts": ROLLOUT_ARRAYS, "checkpoint": CHECKPOINT_ARRAYS}

@@ -146,6 +146,20 @@ class Dynamics:
         """Changes of state (n, ds) less what all other samples predict of them."""
         return self.motion.changes(self.missed)
 
+    def predicted(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Successors (m, ds) and shares of real ends (m, 1) of inputs (m, ds + da), on average."""
+        targets = self.motion.trend(inputs) + self.predict(inputs)
+        states = inputs[:, : self.residuals.shape[1]]
+        return states + self.motion.changes(targets), np.clip(targets[:, -1:], 0.0, 1.0)
+
+    def draw(
+        self, rows: IntArray, inputs: FloatArray, rng: np.random.Generator
+    ) -> tuple[FloatArray, FloatArray]:
+        """One successor (m, ds) each, with the noise of samples (m,); and shares of ends (m,)."""
+        successors, ends = self.predicted(inputs)
+        sides = rng.choice([-1.0, 1.0], size=(len(rows), 1))
+        return successors + sides * self.residuals[rows], ends[:, 0]
+
     def expected_features(
         self, basis: Basis, start: FloatArray, rows: IntArray, inputs: FloatArray
     ) -> FloatArray:
@@ -158,15 +172,13 @@ class Dynamics:
             inputs: (m, ds + da) states and scaled, applied actions.
         """
         expected = np.empty((len(rows), len(start)))
-        width = self.residuals.shape[1]
         for first in range(0, len(rows), ROWS):
             block = slice(first, first + ROWS)
-            targets = self.motion.trend(inputs[block]) + self.predict(inputs[block])
-            successors = inputs[block, :width] + self.motion.changes(targets)
+            successors, ends = self.predicted(inputs[block])
             residuals = self.residuals[rows[block]]
             spread = 0.5 * basis.features(successors + residuals)
             spread += 0.5 * basis.features(successors - residuals)
-            expected[block] = after_ends(spread, np.clip(targets[:, -1:], 0.0, 1.0), start)
+            expected[block] = after_ends(spread, ends, start)
         return expected
 
 

@@ -2,9 +2,10 @@
 
 The weights of Eq. 1 can only choose among the actions that happened to be taken, one in each state.
 A transition model predicts for *any* action, so more can be asked of the same roll-outs: in the
-states as the first step reweighted them, actions are drawn from the policy that it gave, and the
-same convex problem is solved once more for them.  The KL bound then holds from that policy, so that
-old roll-outs no longer tie the new policy to the old ones that made them.
+states as the first step reweighted them, and in those that the model leads its policy to, actions
+are drawn from this policy, and the same convex problem is solved once more for them.  The KL bound
+then holds from that policy, so that old roll-outs no longer tie the new policy to the old ones that
+made them.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kreps.algorithms.imagined_rollouts import Simulator
 from kreps.algorithms.transition_model import feature_differences
 from kreps.arrays import FloatArray, IntArray
 from kreps.data import TaskSpec
@@ -32,32 +34,38 @@ class Outlook:
     Attributes:
         states: (n, ds).
         features: (n, r) of V there.
+        features_at: (m, r) of V at any states (m, ds).
         restart: (r,) mean features of the states that the process restarts in.
         rewards: (n,) observed, standardised.
-        expect: expected features (m, r) of the successor, of sample numbers (m,) and of their
-            states and scaled, applied actions (m, ds + da).
+        expect: expected features (m, r) of the successor, of states and scaled, applied actions
+            (m, ds + da), and of the samples (m,) that these are of or, if simulated, nearest to.
         reward: what reward (m, 1) is to be expected of such states and actions, from its mean.
+        simulator: tells where a policy leads; None if the model does not.
     """
 
     states: FloatArray
     features: FloatArray
+    features_at: Callable[[FloatArray], FloatArray]
     restart: FloatArray
     rewards: FloatArray
     expect: Callable[[IntArray, FloatArray], FloatArray]
     reward: Callable[[FloatArray], FloatArray]
+    simulator: Simulator | None
 
 
 @dataclass(frozen=True)
 class ImaginedSamples:
-    """m states with actions drawn for them.
+    """m actions drawn in k states.
 
     Attributes:
-        rows: (m,) sample numbers of the states, in order.
+        states: (k, ds).
+        of: (m,) which of the states each action is drawn in, in order.
         actions: (m, da) commanded, in the task's units.
         problem: rewards and differences of features as the model expects them.
     """
 
-    rows: IntArray
+    states: FloatArray
+    of: IntArray
     actions: FloatArray
     problem: DualProblem
 
@@ -77,21 +85,30 @@ def imagine(
     ridge: float,
     rng: np.random.Generator,
 ) -> ImaginedSamples:
-    """Draws of a state from the weights (n,) and of an action from the policy.
+    """Actions of the policy in states drawn by the weights (n,) and in states it is led to.
 
     Args:
         outlook, weights: of n samples.
         policy: to draw actions from.
         task: limits and scale of the actions.
-        settings: ``imagined`` draws a sample, up to `MOST_IMAGINED` in all; the bounds.
+        settings: ``imagined`` draws a sample, up to `MOST_IMAGINED` in all; the share of them in
+            ``imagined_rollouts``; the bounds.
         ridge: rho times the number of draws.
         rng: of the draws.
     """
     count = min(settings.imagined * len(weights), MOST_IMAGINED)
-    rows = resample(weights, count, rng)
-    states = outlook.states[rows]
-    actions = policy.act(states, rng.standard_normal((count, task.action_size)))
-    inputs = np.concatenate([states, task.scaled(task.clip(actions))], axis=1)
+    ahead = 0 if outlook.simulator is None else round(settings.imagined_rollouts * count)
+    rows, of = np.unique(resample(weights, count - ahead, rng), return_inverse=True)
+    states, features = outlook.states[rows], outlook.features[rows]
+    if outlook.simulator is not None and ahead:
+        wanted = -(-ahead // settings.imagined)
+        led, nearest = outlook.simulator.rollouts(policy, wanted, rng)
+        of = np.concatenate([of, len(rows) + np.arange(ahead) * len(led) // ahead])
+        rows = np.concatenate([rows, nearest])
+        states = np.concatenate([states, led])
+        features = np.concatenate([features, outlook.features_at(led)])
+    actions = policy.act(states[of], rng.standard_normal((count, task.action_size)))
+    inputs = np.concatenate([states[of], task.scaled(task.clip(actions))], axis=1)
     # a regression may overshoot what was ever observed, and would be believed
     observed = outlook.rewards
     said = observed.mean() + outlook.reward(inputs)[:, 0]
@@ -99,8 +116,8 @@ def imagine(
     problem = DualProblem(
         rewards=rewards - rewards.max(),
         differences=feature_differences(
-            outlook.features[rows],
-            outlook.expect(rows, inputs),
+            features[of],
+            outlook.expect(rows[of], inputs),
             outlook.restart,
             settings.restart_probability,
         ),
@@ -108,4 +125,4 @@ def imagine(
         ridge=ridge / count,
         eta_floor=max(settings.eta_floor, ETA_LEAST),
     )
-    return ImaginedSamples(rows, actions, problem)
+    return ImaginedSamples(states, of, actions, problem)

@@ -39,6 +39,7 @@ from kreps.algorithms.reps import (
     drawn_noise,
     policy_hyperparameters,
     share_clipped,
+    simulator_of,
     stationarity_ridge,
 )
 from kreps.algorithms.state import LearnerState, Stopwatch
@@ -202,15 +203,17 @@ def update(
         outlook = Outlook(
             states=sample.states,
             features=own,
+            features_at=basis.features,
             restart=restart,
             rewards=rewards[sampled],
             expect=expectation.of_actions,
             reward=regression.mean,
+            simulator=simulator_of(expectation, sample, kernel, task, settings, window),
         )
         share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
         dual = solve_dual(imagined.problem, start=(dual.eta, dual.theta))
-        support = PolicySamples.imagined(sample, imagined, dual.weights, task)
+        support = PolicySamples.imagined(imagined, dual.weights, task)
         x = policy_hyperparameters(support, kernel, settings, x, rng)
         centres = policy_centres(support, kernel, x, settings, rng)
         weights, noise = drawn_noise(support, float(np.exp(x[-1])))
@@ -296,7 +299,9 @@ def expected_successors(
     """
     after = after_ends(observed, sample.terminated[:, None].astype(np.float64), changes.start)
     if settings.model == "sample":
-        return StreamedExpectation(after, None, None, None, 0.0, ObservedSuccessors(changes), ())
+        return StreamedExpectation(
+            after, None, None, None, 0.0, None, ObservedSuccessors(changes), ()
+        )
     inputs = state_actions(sample, task)
 
     def regressed(
@@ -326,7 +331,9 @@ def expected_successors(
         )
         of_actions = partial(dynamics.expected_features, changes.basis, changes.start)
         successors = PredictedSuccessors(changes, motion, model, task)
-        return StreamedExpectation(expected, errors, of_actions, x, model.jitter, successors, bases)
+        return StreamedExpectation(
+            expected, errors, of_actions, x, model.jitter, dynamics, successors, bases
+        )
     from_own = settings.model == "change"
     origin = own if from_own else np.zeros_like(own)
     model, errors, x, bases = regressed(
@@ -338,6 +345,7 @@ def expected_successors(
         lambda rows, asked: origin[rows] + model.mean(asked),
         x,
         model.jitter,
+        None,
         EmbeddedSuccessors(changes, model, task, from_own),
         bases,
     )

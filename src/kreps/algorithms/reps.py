@@ -9,7 +9,8 @@ from math import inf
 
 import numpy as np
 
-from kreps.algorithms.dynamics import fit_dynamics, observed_expectation
+from kreps.algorithms.dynamics import Dynamics, fit_dynamics, observed_expectation
+from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
@@ -21,7 +22,7 @@ from kreps.algorithms.transition_model import (
     successor_features,
 )
 from kreps.arrays import FloatArray, IntArray
-from kreps.data import Rollout, TaskSpec, Transitions
+from kreps.data import Rollout, TaskSpec, Transitions, Window
 from kreps.dual import (
     ETA_LEAST,
     DualProblem,
@@ -182,14 +183,16 @@ def update(
         outlook = Outlook(
             states=data.states,
             features=own,
+            features_at=basis.features,
             restart=restart,
             rewards=rewards,
             expect=expectation.of_actions,
             reward=regression.predictor(targets),
+            simulator=simulator_of(expectation, data, kernel, task, settings, window),
         )
         imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
         dual = solve_dual(imagined.problem, start=(dual.eta, dual.theta))
-        support = PolicySamples.imagined(data, imagined, dual.weights, task)
+        support = PolicySamples.imagined(imagined, dual.weights, task)
         policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
         policy = fit_policy(support, kernel, task, policy_x)
         clock.lap("imagined step")
@@ -249,6 +252,7 @@ class Expectation:
             which they are side by side (m, ds + da); None without a model.
         parameters: log hyper-parameters that the model was fitted with.
         jitter: of its factorisation.
+        dynamics: if it is these that were fitted.
     """
 
     expected: FloatArray
@@ -256,6 +260,36 @@ class Expectation:
     of_actions: Callable[[IntArray, FloatArray], FloatArray] | None
     parameters: FloatArray | None
     jitter: float
+    dynamics: Dynamics | None
+
+
+def simulator_of(
+    expectation: Expectation,
+    data: Transitions,
+    kernel: Kernel,
+    task: TaskSpec,
+    settings: Settings,
+    window: Window,
+) -> Simulator | None:
+    """What simulates the process, if the transition model can.
+
+    Args:
+        expectation: of the samples.
+        data: in memory, of the window.
+        kernel: over states.
+        task, settings, window: of the update.
+    """
+    if expectation.dynamics is None or not can_be_simulated(data, task):
+        return None
+    return Simulator(
+        dynamics=expectation.dynamics,
+        data=data,
+        kernel=kernel,
+        task=task,
+        restart_probability=settings.restart_probability,
+        exploring_starts=settings.exploring_starts,
+        longest=max(map(len, window.rollouts)),
+    )
 
 
 def expected_successors(
@@ -289,14 +323,15 @@ def expected_successors(
             data, basis, own, observed, after_end, dynamics, task
         )
         of_actions = partial(dynamics.expected_features, basis, after_end)
-        return Expectation(expected, errors, of_actions, x, regression.factor.jitter)
+        jitter = regression.factor.jitter
+        return Expectation(expected, errors, of_actions, x, jitter, dynamics)
     origin = embedding_origin(data, features, settings)
     successors = successor_features(data, features) - origin
     model, parameters = transition_model(data, successors, state_kernel, task, settings, start, rng)
     clock.lap("embedding fit")
     expected = origin + model.expected_features(successors)
     if not isinstance(model, KernelEmbedding):
-        return Expectation(expected, None, None, parameters, 0.0)
+        return Expectation(expected, None, None, parameters, 0.0, None)
     predict = model.predictor(successors)
     return Expectation(
         expected,
@@ -304,6 +339,7 @@ def expected_successors(
         lambda rows, inputs: origin[rows] + predict(inputs),
         parameters,
         model.factor.jitter,
+        None,
     )
 
 
@@ -375,9 +411,7 @@ class PolicySamples:
         return cls(data.states[kept], targets, weights, float(weights.sum()), nothing)
 
     @classmethod
-    def imagined(
-        cls, data: Transitions, samples: ImaginedSamples, p: FloatArray, task: TaskSpec
-    ) -> PolicySamples:
+    def imagined(cls, samples: ImaginedSamples, p: FloatArray, task: TaskSpec) -> PolicySamples:
         """One for each state: the weighted mean of the actions that were imagined there.
 
         It leaves the process as many support points as there are states, and a target that several
@@ -386,7 +420,7 @@ class PolicySamples:
         kept = len(p) * p >= DROPPED_WEIGHT
         each = p[kept] * effective_sample_size(p)
         actions = task.scaled(samples.actions[kept])
-        rows, group = np.unique(samples.rows[kept], return_inverse=True)
+        rows, group = np.unique(samples.of[kept], return_inverse=True)
         weights = np.zeros(len(rows))
         targets = np.zeros((len(rows), task.action_size))
         within = np.zeros(len(rows))
@@ -399,7 +433,7 @@ class PolicySamples:
         freedom = float(weights.sum() - each @ share) * task.action_size
         spread = float(weights @ within) / freedom if freedom > 1e-9 * weights.sum() else inf
         evidence = float(weights.sum())
-        return cls(data.states[rows], targets, weights, evidence, within, spread)
+        return cls(samples.states[rows], targets, weights, evidence, within, spread)
 
 
 def policy_hyperparameters(

@@ -1,0 +1,267 @@
+"""Roll-outs in the transition model: where they start, go and end, and what becomes of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import kreps
+from kreps.algorithms import low_rank_reps, reps
+from kreps.algorithms.dynamics import TREND_SAMPLES, Dynamics, Motion, fit_dynamics
+from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
+from kreps.algorithms.imagined_step import Outlook, imagine
+from kreps.algorithms.reps import UpdateInfo
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec, Transitions
+from kreps.kernels import Kernel
+from kreps.settings import settings_of
+
+TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]), periodic=(0,))
+"""An angle and a speed."""
+
+STARTS = np.array([[3.0, 0.0], [-3.0, 0.5]])
+
+
+def turns(rollouts: int = 6, steps: int = 20, seed: int = 0) -> list[Rollout]:
+    """A wheel that is pushed at random from one of two states."""
+    rng = np.random.default_rng(seed)
+    found = []
+    for number in range(rollouts):
+        states = [STARTS[number % 2]]
+        actions = rng.normal(0.0, 1.5, size=(steps, 1))
+        for push in TASK.clip(actions)[:, 0]:
+            speed = 0.9 * states[-1][1] + 0.2 * push + 0.02 * rng.normal()
+            states.append(np.array([states[-1][0] + 0.3 * speed, speed]))
+        observations = np.array(states)
+        found.append(Rollout(observations, actions, np.cos(observations[:-1, 0])))
+    return found
+
+
+class Push:
+    """Half the largest force, whatever the noise; it keeps what it was asked."""
+
+    def __init__(self, force: float = 1.0) -> None:
+        self.force = force
+        self.asked: list[FloatArray] = []
+
+    def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
+        assert noise.shape == (len(states), 1)
+        self.asked.append(states)
+        return np.full((len(states), 1), self.force)
+
+
+def simulator(
+    step: FloatArray | None = None, end: float = 0.0, missed: float = 0.0, **changes: Any
+) -> Simulator:
+    """Of a process in which each action adds its size times a step to the state, and may end it."""
+    data = Transitions.of(turns())
+    step = np.array([0.1, 0.02]) if step is None else step
+    slopes = np.zeros((4, 3))
+    slopes[3, :2] = step
+    slopes[0, 2] = end
+    rows = np.arange(len(data))[:, None]
+    motion = Motion(np.ones(2), slopes)
+    nothing = np.zeros(3)
+    dynamics = Dynamics(
+        motion, lambda inputs: np.zeros((len(inputs), 3)), missed * (rows + 1.0) + nothing
+    )
+    kernel = Kernel(TASK.state_factors, np.array([0.5, 0.5]))
+    return replace(Simulator(dynamics, data, kernel, TASK, 0.1, 0.0, 20), **changes)
+
+
+# ---- the process ------------------------------------------------------------------------------
+
+
+def test_each_state_follows_from_one_before_and_the_first_are_starts() -> None:
+    policy = Push(1.0)  # half the largest force: (0.05, 0.01) a step
+    states, nearest = simulator().rollouts(policy, 100, np.random.default_rng(0))
+    assert states.shape == (100, 2) and nearest.shape == (100,)
+    np.testing.assert_array_equal(np.concatenate(policy.asked), states)
+    first, *later = policy.asked
+    assert {tuple(s) for s in first} == {tuple(s) for s in STARTS}
+    for before, after in zip(policy.asked, later, strict=False):
+        came_from = {tuple(np.round(s + np.array([0.05, 0.01]), 9)) for s in before}
+        assert {tuple(np.round(s, 9)) for s in after} <= came_from
+        assert len(after) <= len(before)
+
+
+def test_actions_are_applied_within_their_limits() -> None:
+    policy = Push(50.0)
+    simulator().rollouts(policy, 40, np.random.default_rng(1))
+    np.testing.assert_allclose(
+        np.unique(np.round(policy.asked[1] - STARTS[0], 9), axis=0)[-1], [0.1, 0.02]
+    )
+
+
+@pytest.mark.parametrize("count", [1, 2, 17, 1000])
+@pytest.mark.parametrize("p", [0.02, 0.5, 0.999])
+def test_there_are_as_many_states_as_were_asked_for(count: int, p: float) -> None:
+    made = simulator(restart_probability=p)
+    states, nearest = made.rollouts(Push(), count, np.random.default_rng(count))
+    assert len(states) == len(nearest) == count
+
+
+def test_lengths_are_those_of_the_restarting_process() -> None:
+    policy = Push()
+    made = simulator(restart_probability=0.2, longest=1000)
+    made.rollouts(policy, 40_000, np.random.default_rng(2))
+    at_step = np.array([len(states) for states in policy.asked[:10]])
+    np.testing.assert_allclose(at_step[1:] / at_step[:-1], 0.8, atol=0.03)
+
+
+def test_none_is_longer_than_the_longest_that_was_seen() -> None:
+    policy = Push()
+    made = simulator(restart_probability=0.001, longest=7)
+    states, _ = made.rollouts(policy, 70, np.random.default_rng(3))
+    assert len(policy.asked) == 7 and len(states) == 70
+    assert {len(each) for each in policy.asked} == {10}
+
+
+def test_a_share_begins_in_any_sampled_state() -> None:
+    for share in (0.0, 0.3, 1.0):
+        policy = Push()
+        made = simulator(exploring_starts=share, restart_probability=0.5)
+        made.rollouts(policy, 4000, np.random.default_rng(4))
+        first = policy.asked[0]
+        known = {tuple(s) for s in made.data.states}
+        assert all(tuple(s) in known for s in first)
+        starts = {tuple(s) for s in STARTS}
+        elsewhere = np.mean([tuple(s) not in starts for s in first])
+        sampled = np.mean([tuple(s) not in starts for s in made.data.states])
+        assert elsewhere == pytest.approx(share * sampled, abs=0.05)
+
+
+def test_a_real_end_ends_them() -> None:
+    certain = simulator(end=1.0, restart_probability=0.01)
+    states, _ = certain.rollouts(Push(), 100, np.random.default_rng(5))
+    assert {tuple(s) for s in states} == {tuple(s) for s in STARTS}
+    assert len(states) < 30  # of twenty steps at most the first one is left
+    policy = Push()
+    made = simulator(end=0.5, restart_probability=1e-3, longest=1000)
+    made.rollouts(policy, 10**6, np.random.default_rng(6))
+    assert len(policy.asked[1]) / len(policy.asked[0]) == pytest.approx(0.5, abs=0.05)
+
+
+def test_the_noise_is_that_of_the_nearest_sample_to_either_side() -> None:
+    made = simulator(missed=1e-3)
+    policy = Push()
+    _, nearest = made.rollouts(policy, 200, np.random.default_rng(7))
+    first, second = policy.asked[:2]
+    rows = nearest[: len(first)]
+    distances = made.kernel.gram(first, made.data.states)
+    np.testing.assert_array_equal(distances[np.arange(len(first)), rows], distances.max(axis=1))
+    sides = set()
+    for state in second:
+        away = state - first - [0.05, 0.01]
+        found = np.abs(np.abs(away) - 1e-3 * (rows[:, None] + 1.0)).max(axis=1)
+        assert found.min() < 1e-9
+        sides.add(np.sign(away[found.argmin(), 0]))
+    assert sides == {-1.0, 1.0}
+
+
+def test_they_stay_in_the_range_of_the_data_but_angles_have_none() -> None:
+    made = simulator(step=np.array([2.0, 1.0]))
+    states, _ = made.rollouts(Push(2.0), 200, np.random.default_rng(8))
+    speeds = made.data.points[:, 1]
+    assert states[:, 1].max() == speeds.max()
+    assert states[:, 0].max() > made.data.points[:, 0].max() + np.pi
+
+
+# ---- who has them -----------------------------------------------------------------------------
+
+
+def test_images_and_few_samples_are_not_simulated() -> None:
+    data = Transitions.of(turns(2, 2 * TREND_SAMPLES))
+    assert len(data) == TREND_SAMPLES * (1 + 2 + 1)
+    assert can_be_simulated(data, TASK)
+    assert not can_be_simulated(Transitions.of(turns(2, 2 * TREND_SAMPLES - 1)), TASK)
+    image = TaskSpec(4, [-1.0], [1.0], groups=((0, 1, 2, 3),), image_shape=(2, 2))
+    plenty = Transitions.of(
+        [Rollout(np.zeros((5000, 4)), np.zeros((4999, 1)), np.zeros(4999))],
+    )
+    assert not can_be_simulated(plenty, image)
+    assert can_be_simulated(plenty, replace(image, groups=(), image_shape=None))
+
+
+def updated(**settings: Any) -> tuple[kreps.KREPS, UpdateInfo]:
+    learner = kreps.KREPS(TASK, **settings)
+    info = learner.update(turns())
+    assert isinstance(info, UpdateInfo)
+    return learner, info
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+@pytest.mark.parametrize(
+    ("settings", "led"),
+    [({}, True), ({"imagined_rollouts": 0.0}, False), ({"model": "change"}, False)],
+)
+def test_the_policy_has_targets_where_no_roll_out_was(
+    approximation: str, settings: dict[str, Any], led: bool
+) -> None:
+    learner, info = updated(approximation=approximation, **settings)
+    assert len(info.dual.weights) == 4 * 120
+    seen = {s.tobytes() for r in turns() for s in r.observations}
+    support = learner.policy.process.states
+    assert any(s.tobytes() not in seen for s in support) is led
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+@pytest.mark.parametrize("share", [0.0, 0.25, 0.5, 1.0])
+def test_a_share_of_the_actions_is_drawn_along_them(
+    approximation: str, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module: Any = reps if approximation == "exact" else low_rank_reps
+    outlooks: list[tuple[Outlook, Any]] = []
+
+    def watch(outlook: Outlook, *others: Any) -> Any:
+        outlooks.append((outlook, imagine(outlook, *others)))
+        return outlooks[-1][1]
+
+    monkeypatch.setattr(module, "imagine", watch)
+    updated(approximation=approximation, imagined_rollouts=share)
+    [(outlook, found)] = outlooks
+    sampled = {s.tobytes() for s in outlook.states}
+    known = np.array([s.tobytes() in sampled for s in found.states])
+    drawn = np.bincount(found.of, minlength=len(found.states))
+    assert drawn.sum() == 480
+    assert drawn[~known].sum() <= 480 * share
+    # only the beginnings of simulated roll-outs are states that are known
+    assert drawn[~known].sum() >= 480 * share * 0.7
+    if share == 1.0:
+        assert set(drawn) == {4}
+
+
+def test_the_same_outlook_has_the_features_of_v_everywhere(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    outlooks: list[Outlook] = []
+
+    def watch(outlook: Outlook, *others: Any) -> Any:
+        outlooks.append(outlook)
+        return imagine(outlook, *others)
+
+    monkeypatch.setattr(reps, "imagine", watch)
+    updated()
+    [outlook] = outlooks
+    np.testing.assert_allclose(outlook.features_at(outlook.states), outlook.features, atol=1e-7)
+    assert outlook.simulator is not None
+    assert outlook.simulator.longest == 20
+
+
+def test_a_policy_is_followed_and_not_the_roll_outs() -> None:
+    """Pushed to one side in the model, all that it is led to lies on that side."""
+    data = Transitions.of(turns(20))
+    rng = np.random.default_rng(9)
+    settings = settings_of(exploring_starts=0.0)
+    kernel = reps.state_kernel(data, TASK, rng)
+    dynamics, *_ = fit_dynamics(data, kernel, TASK, None, rng)
+    made = Simulator(dynamics, data, kernel, TASK, settings.restart_probability, 0.0, 20)
+    right, _ = made.rollouts(Push(2.0), 400, rng)
+    left, _ = made.rollouts(Push(-2.0), 400, rng)
+    assert right[:, 1].mean() > 0.5 and left[:, 1].mean() < -0.2
+    # pushed for long the speed would go to 4; no more is known than the most that was seen
+    most = data.points[:, 1].max()
+    assert right[:, 1].max() == pytest.approx(most, rel=0.3)
