@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 import kreps
+from kreps import policies
 from kreps.algorithms import low_rank_reps, reps
 from kreps.algorithms.dynamics import TREND_SAMPLES, Dynamics, Motion, fit_dynamics
 from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
 from kreps.algorithms.imagined_step import Outlook, imagine
 from kreps.algorithms.reps import UpdateInfo
+from kreps.algorithms.transition_model import feature_differences
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.kernels import Kernel
@@ -168,6 +170,9 @@ def test_they_stay_in_the_range_of_the_data_but_angles_have_none() -> None:
     speeds = made.data.points[:, 1]
     assert states[:, 1].max() == speeds.max()
     assert states[:, 0].max() > made.data.points[:, 0].max() + np.pi
+    states, _ = made.rollouts(Push(-2.0), 200, np.random.default_rng(8))
+    assert states[:, 1].min() == speeds.min()
+    assert states[:, 0].min() < made.data.points[:, 0].min() - np.pi
 
 
 # ---- who has them -----------------------------------------------------------------------------
@@ -234,9 +239,10 @@ def test_a_share_of_the_actions_is_drawn_along_them(
         assert set(drawn) == {4}
 
 
-def test_the_same_outlook_has_the_features_of_v_everywhere(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def outlook_of(
+    rollouts: list[Rollout], monkeypatch: pytest.MonkeyPatch, **settings: Any
+) -> Outlook:
+    """What the exact update sees, of roll-outs of any width."""
     outlooks: list[Outlook] = []
 
     def watch(outlook: Outlook, *others: Any) -> Any:
@@ -244,11 +250,116 @@ def test_the_same_outlook_has_the_features_of_v_everywhere(
         return imagine(outlook, *others)
 
     monkeypatch.setattr(reps, "imagine", watch)
-    updated()
+    task = settings.pop("task", TASK)
+    kreps.KREPS(task, approximation="exact", **settings).update(rollouts)
     [outlook] = outlooks
+    return outlook
+
+
+def test_the_update_simulates_its_own_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    rollouts = [*turns(2, 12), *turns(2, 31, seed=1), *turns(2, 7, seed=2)]
+    outlook = outlook_of(rollouts, monkeypatch, restart_probability=0.03, exploring_starts=0.4)
     np.testing.assert_allclose(outlook.features_at(outlook.states), outlook.features, atol=1e-7)
-    assert outlook.simulator is not None
-    assert outlook.simulator.longest == 20
+    made = outlook.simulator
+    assert made is not None
+    assert (made.longest, made.restart_probability, made.exploring_starts) == (31, 0.03, 0.4)
+    np.testing.assert_array_equal(made.data.states, outlook.states)
+
+
+def test_what_cannot_be_simulated_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert outlook_of(turns(2, 19), monkeypatch).simulator is None  # too few
+    assert outlook_of(turns(), monkeypatch, model="change").simulator is None
+    image = TaskSpec(4, [-1.0], [1.0], groups=((0, 1, 2, 3),), image_shape=(2, 2))
+    rng = np.random.default_rng(0)
+    shots = [
+        Rollout(rng.uniform(size=(41, 4)), rng.uniform(-1, 1, size=(40, 1)), rng.uniform(size=40))
+        for _ in range(4)
+    ]
+    assert outlook_of(shots, monkeypatch, task=image).simulator is None
+    plain = replace(image, groups=(), image_shape=None)
+    assert outlook_of(shots, monkeypatch, task=plain).simulator is not None
+
+
+class Known:
+    """Roll-outs that are given: three states beside the samples 4, 0 and 2."""
+
+    states = np.array([[0.3, 0.1], [0.7, -0.4], [-0.2, 0.9]])
+    nearest = np.array([4, 0, 2])
+
+    def rollouts(self, *arguments: Any) -> tuple[FloatArray, Any]:
+        return self.states, self.nearest
+
+
+def test_each_state_has_its_own_features_and_the_noise_of_its_sample(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    outlook = outlook_of(turns(), monkeypatch)
+    n = len(outlook.states)
+    asked: list[tuple[Any, FloatArray]] = []
+
+    def expect(rows: Any, inputs: FloatArray) -> FloatArray:
+        asked.append((rows, inputs))
+        return outlook.expect(rows, inputs)
+
+    known: Any = Known()
+    settings = settings_of(imagined=2, imagined_rollouts=0.25)
+    found = imagine(
+        replace(outlook, simulator=known, expect=expect),
+        np.full(n, 1.0 / n),
+        Push(),
+        TASK,
+        settings,
+        0.3,
+        np.random.default_rng(0),
+    )
+    np.testing.assert_array_equal(found.states[-3:], Known.states)
+    ahead = round(0.25 * 2 * n)
+    led = found.of >= len(found.states) - 3
+    assert np.count_nonzero(led) == ahead
+    np.testing.assert_array_equal(np.bincount(found.of)[-3:], np.full(3, ahead / 3))
+    [(rows, inputs)] = asked
+    np.testing.assert_array_equal(rows[led], np.repeat(Known.nearest, ahead // 3))
+    np.testing.assert_array_equal(outlook.states[rows[~led]], found.states[found.of[~led]])
+    np.testing.assert_array_equal(inputs[:, :2], found.states[found.of])
+    wanted = feature_differences(
+        outlook.features_at(found.states[found.of]),
+        outlook.expect(rows, inputs),
+        outlook.restart,
+        settings.restart_probability,
+    )
+    np.testing.assert_allclose(found.problem.differences, wanted, atol=1e-7)
+    # it matters which sample a state is nearest to
+    other = outlook.expect(np.zeros_like(rows), inputs)
+    assert np.abs(other - outlook.expect(rows, inputs)).max() > 1e-3
+
+
+def test_the_support_of_an_exact_policy_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
+    still = [replace(r, rewards=np.ones(len(r))) for r in turns()]
+    many = kreps.KREPS(TASK, approximation="exact")
+    many.update(still)
+    count = len(many.policy.process.states)
+    assert count > 120  # more targets than samples
+    for module in (reps, policies):
+        monkeypatch.setattr(module, "MAX_SUPPORT", 120)
+    few = kreps.KREPS(TASK, approximation="exact")
+    few.update(still)
+    assert len(few.policy.process.states) == 120
+    of_all = {s.tobytes() for s in many.policy.process.states}
+    assert {s.tobytes() for s in few.policy.process.states} <= of_all
+
+
+def test_the_heaviest_targets_stay_in_order() -> None:
+    weights = np.array([3.0, 1.0, 4.0, 1.0, 5.0])
+    samples = reps.PolicySamples(
+        np.arange(10.0).reshape(5, 2), np.arange(5.0)[:, None], weights, 14.0, np.arange(5.0)
+    )
+    found = samples.heaviest(3)
+    np.testing.assert_array_equal(found.weights, [3.0, 4.0, 5.0])
+    np.testing.assert_array_equal(found.targets[:, 0], [0.0, 2.0, 4.0])
+    np.testing.assert_array_equal(found.within, [0.0, 2.0, 4.0])
+    np.testing.assert_array_equal(found.states[:, 0], [0.0, 4.0, 8.0])
+    assert found.evidence == 14.0
+    assert samples.heaviest(5) is samples
 
 
 def test_a_policy_is_followed_and_not_the_roll_outs() -> None:

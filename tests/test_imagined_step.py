@@ -13,7 +13,6 @@ import pytest
 import kreps
 from kreps.algorithms import imagined_step, low_rank_reps, reps, transition_model
 from kreps.algorithms.dynamics import Motion
-from kreps.algorithms.imagined_rollouts import Simulator
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine, resample
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
@@ -134,7 +133,6 @@ class Case:
     rewards: FloatArray
     expectation: reps.Expectation
     reward: Callable[[FloatArray], FloatArray]
-    simulator: Simulator | None = None
 
     @classmethod
     def of(cls, **changes: Any) -> Case:
@@ -166,7 +164,7 @@ class Case:
             rewards=self.rewards,
             expect=self.expectation.of_actions,
             reward=self.reward if reward is None else reward,
-            simulator=self.simulator,
+            simulator=None,
         )
 
     def imagined(

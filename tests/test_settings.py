@@ -91,7 +91,11 @@ def test_an_unknown_parameter_is_refused_with_the_choices() -> None:
         ],
         *[("ridge", value) for value in (0.0, -1.0, float("inf"), float("nan"), "1", True)],
         *[("imagined", value) for value in (-1, 2.5, 4.0, "4", True, None)],
-        *[("exploring_starts", value) for value in (-0.1, 1.1, float("nan"), "1", True, None)],
+        *[
+            (name, value)
+            for name in ("exploring_starts", "imagined_rollouts")
+            for value in (-0.1, 1.1, float("nan"), "1", True, None)
+        ],
         *[("eta_floor", value) for value in (-1e-9, float("inf"), float("nan"), "0", False)],
         *[("restart_probability", value) for value in (0.0, 1.0, -0.1, 1.5, float("nan"), "0.1")],
         *[
@@ -125,6 +129,8 @@ def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
         ("imagined", 0),
         ("exploring_starts", 0.0),
         ("exploring_starts", 1.0),
+        ("imagined_rollouts", 0),
+        ("imagined_rollouts", 1.0),
         ("imagined", 1),
         ("model", "embedding"),
         ("features", "grid"),

@@ -916,16 +916,24 @@ def test_forged_checkpoints_are_refused(
         file.refused_with(tmp_path / method, header={**file.header, **changes})
 
 
-@pytest.mark.parametrize("changes", [{}, {"model": "sample", "ridge": 0.1}])
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"model": "sample", "ridge": 0.1}, {"imagined": 4, "exploring_starts": 0.25}],
+)
 def test_checkpoints_of_before_a_setting_was_there_keep_their_meaning(
     changes: dict[str, Any], files: dict[str, Good], tmp_path: Path
 ) -> None:
     file = files["reps checkpoint"]
     settings = {**file.header["settings"], **changes}
-    del settings["imagined"], settings["exploring_starts"]
+    later = {"imagined": 0, "exploring_starts": 0.0, "imagined_rollouts": 0.0}
+    for name in set(later) - set(changes):
+        del settings[name]
     path = forge(tmp_path / "old", file.tensors, {**file.header, "settings": settings})
     learner = kreps.KREPS.resume(path, gym.make("kreps/SwingUp-v0"))
-    assert (learner.settings.imagined, learner.settings.exploring_starts) == (0, 0.0)
+    assert {name: getattr(learner.settings, name) for name in later} == {
+        **later,
+        **{name: value for name, value in changes.items() if name in later},
+    }
     assert {k: v for k, v in vars(learner.settings).items() if k in settings} == settings
     learner.learn(1, progress=False)
     assert learner.state.iteration == file.header["iteration"] + 1

@@ -101,12 +101,13 @@ class Settings(OnPolicySettings):
             takes the mean squared leave-one-out error of the transition model: stationarity is
             asked for as strictly as successors can be predicted (but not below 0.001).
         exploring_starts: share of the random restarts that an update plans with in any of the
-            sampled states instead of the start states, so that V is learnt beside the way, too;
-            roll-outs begin where the environment begins them.
+            sampled states instead of the start states, so that V is learnt beside the way, too; and
+            of the imagined roll-outs that begin there.  Real ones begin where the environment does.
         imagined: actions per state that are drawn anew for a second bounded step, in which the
             model says what they lead to; 0 leaves that step out.
         imagined_rollouts: share of these actions in states that the policy is led to in roll-outs
-            simulated by the model ``"dynamics"``, the others in sampled states; none in images.
+            simulated by the model ``"dynamics"``, the others in sampled states.  There are none in
+            images, nor with fewer than ten samples for each coordinate of state and action.
         model: transition model: ``"dynamics"`` regresses how the state changes, after a linear
             trend, and takes the features of V where that leads; ``"change"`` embeds how the
             features change, so that far from the data the state stays; ``"embedding"`` embeds the

@@ -168,7 +168,7 @@ class Dynamics:
         Args:
             basis: of V.
             start: (r,) mean features of the start states: what follows a real end.
-            rows: (m,) the samples whose states the actions are taken in.
+            rows: (m,) the samples whose states the actions are taken in, or that are nearest.
             inputs: (m, ds + da) states and scaled, applied actions.
         """
         expected = np.empty((len(rows), len(start)))

@@ -37,8 +37,8 @@ class Outlook:
         features_at: (m, r) of V at any states (m, ds).
         restart: (r,) mean features of the states that the process restarts in.
         rewards: (n,) observed, standardised.
-        expect: expected features (m, r) of the successor, of states and scaled, applied actions
-            (m, ds + da), and of the samples (m,) that these are of or, if simulated, nearest to.
+        expect: expected features (m, r) of the successor, of the samples (m,) that states are of
+            or, if simulated, nearest to, and of states and scaled, applied actions (m, ds + da).
         reward: what reward (m, 1) is to be expected of such states and actions, from its mean.
         simulator: tells where a policy leads; None if the model does not.
     """

@@ -186,7 +186,7 @@ def update(
     policy = fit_sparse(task, centres, policy_sums, x, float(np.exp(x[-1])))
     clock.lap("policy")
 
-    # the same once more, for other actions in the states of the sample
+    # the same once more, for other actions in the states of the sample and where they lead
     reward_start = state.reward_start
     if settings.imagined and expectation.of_actions is not None and seen is not None:
         inputs = state_actions(sample, task)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from math import inf
 
@@ -35,7 +35,7 @@ from kreps.dual import (
 from kreps.embedding import KernelEmbedding, LeaveOneOut, SampleModel, TransitionModel
 from kreps.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel
-from kreps.policies import CostSensitiveGP
+from kreps.policies import MAX_SUPPORT, CostSensitiveGP
 from kreps.settings import Settings
 from kreps.value import Basis, RBFGrid, RKHSBasis
 
@@ -173,7 +173,7 @@ def update(
     policy = fit_policy(support, kernel, task, policy_x)
     clock.lap("policy")
 
-    # the same once more, for other actions in these states
+    # the same once more, for other actions in these states and where they lead
     reward_start = state.reward_start
     if settings.imagined and expectation.of_actions is not None:
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
@@ -192,7 +192,7 @@ def update(
         )
         imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
         dual = solve_dual(imagined.problem, start=(dual.eta, dual.theta))
-        support = PolicySamples.imagined(imagined, dual.weights, task)
+        support = PolicySamples.imagined(imagined, dual.weights, task).heaviest(MAX_SUPPORT)
         policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
         policy = fit_policy(support, kernel, task, policy_x)
         clock.lap("imagined step")
@@ -248,8 +248,8 @@ class Expectation:
     Attributes:
         expected: (n, r) ``E[phi(s') | s_i, a_i]``.
         errors: of the model; None without one.
-        of_actions: the same (m, r) for sample numbers (m,) and other actions in their states, with
-            which they are side by side (m, ds + da); None without a model.
+        of_actions: the same (m, r) for sample numbers (m,) and other actions in their states, or
+            in states that they are nearest to, side by side (m, ds + da); None without a model.
         parameters: log hyper-parameters that the model was fitted with.
         jitter: of its factorisation.
         dynamics: if it is these that were fitted.
@@ -434,6 +434,19 @@ class PolicySamples:
         spread = float(weights @ within) / freedom if freedom > 1e-9 * weights.sum() else inf
         evidence = float(weights.sum())
         return cls(samples.states[rows], targets, weights, evidence, within, spread)
+
+    def heaviest(self, most: int) -> PolicySamples:
+        """At most so many of them, in order."""
+        if len(self.weights) <= most:
+            return self
+        kept = np.sort(np.argsort(-self.weights, kind="stable")[:most])
+        return replace(
+            self,
+            states=self.states[kept],
+            targets=self.targets[kept],
+            weights=self.weights[kept],
+            within=self.within[kept],
+        )
 
 
 def policy_hyperparameters(
