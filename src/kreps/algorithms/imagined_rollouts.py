@@ -65,9 +65,10 @@ class Simulator:
         left = left[: 1 + np.searchsorted(np.cumsum(left), count)]
         left[-1] -= left.sum() - count
         visited, nearest = [], []
+        sampled, (low, high) = self.data.states, self._range
         states = self._starts(len(left), rng)
         while len(states):
-            rows = np.argmax(self.kernel.gram(states, self.data.states), axis=1)
+            rows = np.argmax(self.kernel.gram(states, sampled), axis=1)
             visited.append(states)
             nearest.append(rows)
             noise = rng.standard_normal((len(states), self.task.action_size))
@@ -75,7 +76,7 @@ class Simulator:
             inputs = np.concatenate([states, actions], axis=1)
             successors, ends = self.dynamics.draw(rows, inputs, rng)
             left = np.where(rng.uniform(size=len(ends)) < ends, 0, left - 1)
-            states, left = self._seen(successors)[left > 0], left[left > 0]
+            states, left = np.clip(successors, low, high)[left > 0], left[left > 0]
         return np.concatenate(visited), np.concatenate(nearest)
 
     def _starts(self, count: int, rng: np.random.Generator) -> FloatArray:
@@ -83,12 +84,13 @@ class Simulator:
         anywhere = self.data.states[rng.choice(len(self.data), count)]
         return np.where(rng.uniform(size=(count, 1)) < self.exploring_starts, anywhere, starts)
 
-    def _seen(self, states: FloatArray) -> FloatArray:
-        """States moved into the range of the data: beyond it nothing is known that could stop one.
+    @property
+    def _range(self) -> tuple[FloatArray, FloatArray]:
+        """Least and largest state (ds,) seen: beyond them nothing is known that could stop one.
 
-        Angles have no range.
+        Angles have no limits.
         """
-        within = np.clip(states, self.data.points.min(axis=0), self.data.points.max(axis=0))
+        low, high = self.data.points.min(axis=0), self.data.points.max(axis=0)
         angles = list(self.task.periodic)
-        within[:, angles] = states[:, angles]
-        return within
+        low[angles], high[angles] = -np.inf, np.inf
+        return low, high
