@@ -321,6 +321,12 @@ GAP_TOLERANCE = 1e-6
 KL_TOLERANCE = 1e-4  # relative to the bound
 """All three are asked for: the decrement alone lies as eta -> 0, where the curvature explodes."""
 
+CENTRED = 0.01
+"""Decrement, in units of eta, above which theta has to be mended before eta may move.
+
+``exp(delta / eta)`` is quadratic only where delta changes by less than eta.  A temperature that runs
+ahead of its theta leaves no step that is both long and downhill."""
+
 
 def solve_dual(
     problem: Problem,
@@ -332,13 +338,17 @@ def solve_dual(
     Args:
         problem: the update's data.
         max_iterations: of the joint Newton method before the fallback takes over.
-        start: eta and theta to start from, such as the solution for a part of the samples.
+        start: eta and theta to start from where that is better than to know nothing, such as the
+            solution for a part of the samples.
     """
-    if start is None:
-        # Where all rewards agree nothing can be gained: the temperature belongs to its floor.
-        eta = max(1.0, problem.eta_floor) if problem.rewards.any() else problem.eta_floor
-        start = eta, np.zeros(problem.rank)
-    end = _newton(problem, *start, max_iterations, eta_free=True)
+    # Where all rewards agree nothing can be gained: the temperature belongs to its floor.
+    eta = max(1.0, problem.eta_floor) if problem.rewards.any() else problem.eta_floor
+    theta = np.zeros(problem.rank)
+    if start is not None:
+        given = max(start[0], problem.eta_floor), start[1]
+        if dual_value(problem, *given) <= dual_value(problem, eta, theta):
+            eta, theta = given
+    end = _newton(problem, eta, theta, max_iterations, eta_free=True)
     outcome = Outcome.BOUND_ACTIVE
     if not end.converged:
         end = _bisection(problem, end)
@@ -373,38 +383,45 @@ def _certify(problem: Problem, end: _Progress, outcome: Outcome) -> DualSolution
 def _newton(
     problem: Problem, eta: float, theta: FloatArray, max_iterations: int, *, eta_free: bool
 ) -> _Progress:
-    """Damped Newton from ``(eta, theta)``, projected on ``eta >= floor``; or in theta alone."""
+    """Damped Newton from ``(eta, theta)``, projected on ``eta >= floor``; or in theta alone.
+
+    Eta waits until theta is `CENTRED`, so that the run follows the path of best thetas.
+    """
     floor = problem.eta_floor
     here = problem.moments(eta, theta, scatter=True)
     value = _value(problem, theta, here)
     decrement, before, jitter = np.inf, 1.0, 0.0
+    shortened = False
     for iteration in range(max_iterations):
         g_eta, g_theta = _gradient(problem, theta, here)
         hessian = _hessian(problem, here)
-        at_floor = eta <= floor
-        moves_eta = eta_free and not (at_floor and g_eta >= 0)
-        stretch = 0.0  # relative change of eta
-        if moves_eta:
-            factor = cholesky(hessian)
-            step = -factor.solve(np.append(g_theta, eta * g_eta))
-            step, stretch = step[:-1], float(step[-1])
-            moves_eta = not (at_floor and stretch < 0)
-        if not moves_eta:
-            factor = cholesky(hessian[:-1, :-1])
-            step, stretch = -factor.solve(g_theta), 0.0
+        factor = cholesky(hessian[:-1, :-1])
         jitter = max(jitter, factor.jitter)
+        step, stretch = -factor.solve(g_theta), 0.0  # the latter a relative change of eta
+        at_floor = eta <= floor
+        centred = -0.5 * float(g_theta @ step) <= CENTRED * eta
+        moves_eta = eta_free and centred and not (at_floor and g_eta >= 0)
+        if moves_eta:
+            joint = cholesky(hessian)
+            both = -joint.solve(np.append(g_theta, eta * g_eta))
+            moves_eta = not (at_floor and both[-1] < 0)
+            if moves_eta:
+                factor, step, stretch = joint, both[:-1], float(both[-1])
+                jitter = max(jitter, factor.jitter)
         slope = float(g_theta @ step) + eta * g_eta * stretch
         decrement = -0.5 * slope
         if _done(problem, g_eta if moves_eta else 0.0, g_theta, decrement):
             return _Progress(eta, theta, here, decrement, iteration, jitter, True)
-        least = max(0.5, floor / eta) - 1.0  # eta at most halves and never passes its floor
-        length = 1.0 if stretch >= least else least / stretch
+        # eta at most halves or doubles, and never passes its floor
+        allowed = min(max(stretch, 0.5 - 1.0, floor / eta - 1.0), 2.0 - 1.0)
+        length = 1.0 if allowed == stretch else allowed / stretch
         rounding = 1e-14 * max(1.0, abs(value))
-        # The first try is mostly good enough, so its curvature is taken in the same pass; but
-        # where it should be the last, converging at least as fast as before, none is needed.
+        # The first try is good enough where the one before was, so its curvature is taken in the
+        # same pass; but where it should be the last, converging as fast as before, none is needed.
         expected = decrement * min(1.0, decrement / before)
         before = decrement
-        scatter = 10.0 * expected > DECREMENT_TOLERANCE
+        scatter = not shortened and 10.0 * expected > DECREMENT_TOLERANCE
+        shortened = False
         while length > 1e-12:
             new_eta = max(eta * (1.0 + length * stretch), floor)
             if new_eta <= floor * (1.0 + 1e-9):
@@ -415,7 +432,7 @@ def _newton(
             if new_value <= value + 1e-4 * length * slope + rounding:
                 break
             length *= 0.5
-            scatter = False
+            scatter, shortened = False, True
         else:
             return _Progress(eta, theta, here, decrement, iteration, jitter, False)
         eta, theta, value, here = new_eta, new_theta, new_value, there
@@ -424,7 +441,7 @@ def _newton(
             g = np.append(g_theta, eta * g_eta) if moves_eta else g_theta
             decrement = 0.5 * float(g @ factor.solve(g))
             # by the last Hessian, hence the margin; where eta comes to its floor or leaves it, no
-            settled = eta > floor if moves_eta else g_eta >= 0 or not eta_free
+            settled = eta > floor if moves_eta else (at_floor and g_eta >= 0) or not eta_free
             if settled and _done(problem, g_eta if moves_eta else 0.0, g_theta, 10.0 * decrement):
                 return _Progress(eta, theta, here, decrement, iteration + 1, jitter, True)
             here = problem.moments(eta, theta, scatter=True)

@@ -212,7 +212,7 @@ def update(
         )
         share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
-        dual = solve_dual(imagined.problem, start=(dual.eta, dual.theta))
+        dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
         support = PolicySamples.imagined(imagined, dual.weights, task)
         x = policy_hyperparameters(support, kernel, settings, x, rng)
         centres = policy_centres(support, kernel, x, settings, rng)

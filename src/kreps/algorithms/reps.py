@@ -191,7 +191,7 @@ def update(
             simulator=simulator_of(expectation, data, kernel, task, settings, window),
         )
         imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
-        dual = solve_dual(imagined.problem, start=(dual.eta, dual.theta))
+        dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
         support = PolicySamples.imagined(imagined, dual.weights, task).heaviest(MAX_SUPPORT)
         policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
         policy = fit_policy(support, kernel, task, policy_x)
