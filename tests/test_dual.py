@@ -662,6 +662,22 @@ def test_the_solution_does_not_depend_on_where_the_solver_starts(seed: int) -> N
     assert solve_dual(problem, start=(cold.eta, cold.theta)).iterations == 0
 
 
+def test_a_start_that_is_worse_than_none_is_not_taken() -> None:
+    """At the floor a wrong V decides over single samples, and Newton's steps would be tiny."""
+    problem = floor_problem(0)
+    cold = solve_dual(problem)
+    wrong = 1e3 * np.random.default_rng(0).normal(size=problem.rank)
+    found = solve_dual(problem, start=(problem.eta_floor, wrong))
+    assert found.iterations == cold.iterations
+    np.testing.assert_array_equal(found.weights, cold.weights)
+
+
+def test_a_start_below_the_floor_begins_at_it() -> None:
+    problem = floor_problem(0)
+    found = solve_dual(problem, start=(0.1 * problem.eta_floor, solve_dual(problem).theta))
+    assert found.iterations == 0 and found.eta == problem.eta_floor
+
+
 def test_the_floor_is_found_from_a_start_at_it_and_from_far_above_it() -> None:
     problem = floor_problem(0)
     cold = solve_dual(problem)

@@ -17,7 +17,7 @@ from typing import Protocol
 import numpy as np
 
 from kreps.arrays import Array, FloatArray, as_numpy, namespace
-from kreps.linalg import cholesky
+from kreps.linalg import Cholesky, cholesky
 
 ETA_LEAST = 1e-6
 """Floor of the temperature where none is asked for: below it there is nothing left to gain."""
@@ -324,8 +324,8 @@ KL_TOLERANCE = 1e-4  # relative to the bound
 CENTRED = 0.01
 """Decrement, in units of eta, above which theta has to be mended before eta may move.
 
-``exp(delta / eta)`` is quadratic only where delta changes by less than eta.  A temperature that runs
-ahead of its theta leaves no step that is both long and downhill."""
+``exp(delta / eta)`` is nearly quadratic only where delta changes by less than eta.  A temperature
+that runs ahead of its theta leaves no step that is both long and downhill."""
 
 
 def solve_dual(
@@ -402,12 +402,10 @@ def _newton(
         centred = -0.5 * float(g_theta @ step) <= CENTRED * eta
         moves_eta = eta_free and centred and not (at_floor and g_eta >= 0)
         if moves_eta:
-            joint = cholesky(hessian)
-            both = -joint.solve(np.append(g_theta, eta * g_eta))
-            moves_eta = not (at_floor and both[-1] < 0)
+            both, change = _joint_step(factor, hessian, step, eta * g_eta)
+            moves_eta = not (at_floor and change < 0)
             if moves_eta:
-                factor, step, stretch = joint, both[:-1], float(both[-1])
-                jitter = max(jitter, factor.jitter)
+                step, stretch = both, change
         slope = float(g_theta @ step) + eta * g_eta * stretch
         decrement = -0.5 * slope
         if _done(problem, g_eta if moves_eta else 0.0, g_theta, decrement):
@@ -438,14 +436,34 @@ def _newton(
         eta, theta, value, here = new_eta, new_theta, new_value, there
         if here.scatter is None:
             g_eta, g_theta = _gradient(problem, theta, here)
-            g = np.append(g_theta, eta * g_eta) if moves_eta else g_theta
-            decrement = 0.5 * float(g @ factor.solve(g))
+            step, stretch = -factor.solve(g_theta), 0.0
+            if moves_eta:
+                step, stretch = _joint_step(factor, hessian, step, eta * g_eta)
+            decrement = -0.5 * (float(g_theta @ step) + eta * g_eta * stretch)
             # by the last Hessian, hence the margin; where eta comes to its floor or leaves it, no
             settled = eta > floor if moves_eta else (at_floor and g_eta >= 0) or not eta_free
             if settled and _done(problem, g_eta if moves_eta else 0.0, g_theta, 10.0 * decrement):
                 return _Progress(eta, theta, here, decrement, iteration + 1, jitter, True)
             here = problem.moments(eta, theta, scatter=True)
     return _Progress(eta, theta, here, decrement, max_iterations, jitter, False)
+
+
+def _joint_step(
+    factor: Cholesky, hessian: FloatArray, step: FloatArray, g_eta: float
+) -> tuple[FloatArray, float]:
+    """Newton's step in theta (r,) and eta, from that in theta alone: the last row eliminated.
+
+    Args:
+        factor: of the block of theta.
+        hessian: (r + 1, r + 1) whole.
+        step: (r,) in theta alone.
+        g_eta: gradient in the scaled eta.
+    """
+    mixed, own = hessian[:-1, -1], float(hessian[-1, -1])
+    follows = factor.solve(mixed)  # minus how theta follows eta
+    complement = max(own - float(mixed @ follows), 1e-12 * own, np.finfo(float).tiny)
+    stretch = -(g_eta + float(mixed @ step)) / complement
+    return step - stretch * follows, stretch
 
 
 def _done(problem: Problem, g_eta: float, g_theta: FloatArray, decrement: float) -> bool:
