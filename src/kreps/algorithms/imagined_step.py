@@ -91,8 +91,8 @@ def imagine(
         outlook, weights: of n samples.
         policy: to draw actions from.
         task: limits and scale of the actions.
-        settings: ``imagined`` draws a sample, up to `MOST_IMAGINED` in all; the share of them in
-            ``imagined_rollouts``; the bounds.
+        settings: ``imagined`` draws a sample, up to `MOST_IMAGINED` in all, with
+            ``imagined_noise``; the share of them in ``imagined_rollouts``; the bounds.
         ridge: rho times the number of draws.
         rng: of the draws.
     """
@@ -107,7 +107,8 @@ def imagine(
         rows = np.concatenate([rows, nearest])
         states = np.concatenate([states, led])
         features = np.concatenate([features, outlook.features_at(led)])
-    actions = policy.act(states[of], rng.standard_normal((count, task.action_size)))
+    noise = settings.imagined_noise * rng.standard_normal((count, task.action_size))
+    actions = policy.act(states[of], noise)
     inputs = np.concatenate([states[of], task.scaled(task.clip(actions))], axis=1)
     # a regression may overshoot what was ever observed, and would be believed
     observed = outlook.rewards

@@ -218,7 +218,7 @@ def update(
         centres = policy_centres(support, kernel, x, settings, rng)
         weights, noise = drawn_noise(support, float(np.exp(x[-1])))
         policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
-        policy = fit_sparse(task, centres, policy_sums, x, noise)
+        policy = fit_sparse(task, centres, policy_sums, x, noise, 1.0 / settings.imagined_noise)
         clock.lap("imagined step")
     bases.append(centres)
 
@@ -394,10 +394,20 @@ def policy_centres(
 
 
 def fit_sparse(
-    task: TaskSpec, centres: RKHSBasis, sums: PolicySums, x: FloatArray, noise: float
+    task: TaskSpec,
+    centres: RKHSBasis,
+    sums: PolicySums,
+    x: FloatArray,
+    noise: float,
+    deviation: float = 1.0,
 ) -> SparseGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,), its actions drawn with ``noise``."""
-    return SparseGP.fit(task, centres, sums, signal=float(np.exp(x[-2])), noise=noise)
+    """The policy at log hyper-parameters ``x`` (g + 2,) with a given noise.
+
+    Its deviation is multiplied by ``deviation``; its mean stays.
+    """
+    scale = deviation**2
+    signal = scale * float(np.exp(x[-2]))
+    return SparseGP.fit(task, centres, sums, signal=signal, noise=scale * noise)
 
 
 def solve(

@@ -194,7 +194,7 @@ def update(
         dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
         support = PolicySamples.imagined(imagined, dual.weights, task).heaviest(MAX_SUPPORT)
         policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
-        policy = fit_policy(support, kernel, task, policy_x)
+        policy = fit_policy(support, kernel, task, policy_x, 1.0 / settings.imagined_noise)
         clock.lap("imagined step")
 
     new_state = state.after(
@@ -510,16 +510,21 @@ def drawn_noise(samples: PolicySamples, fitted: float) -> tuple[FloatArray, floa
 
 
 def fit_policy(
-    samples: PolicySamples, state_kernel: Kernel, task: TaskSpec, x: FloatArray
+    samples: PolicySamples,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    x: FloatArray,
+    deviation: float = 1.0,
 ) -> CostSensitiveGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,)."""
+    """The policy at log hyper-parameters ``x`` (g + 2,), its deviation multiplied."""
     weights, noise = drawn_noise(samples, float(np.exp(x[-1])))
+    scale = deviation**2  # of signal and noise alike, so that the mean stays
     return CostSensitiveGP(
         task,
         state_kernel.with_lengthscales(np.exp(x[:-2])),
         samples.states,
         samples.targets,
         weights,
-        signal=float(np.exp(x[-2])),
-        noise=noise,
+        signal=scale * float(np.exp(x[-2])),
+        noise=scale * noise,
     )
