@@ -13,13 +13,16 @@ from scipy.special import logsumexp
 
 from kreps.arrays import FloatArray, IntArray
 from kreps.dual import (
+    CENTRED,
     DECREMENT_TOLERANCE,
+    ETA_LEAST,
     GAP_TOLERANCE,
     KL_TOLERANCE,
     DualProblem,
     DualSolution,
     Moments,
     Outcome,
+    _newton,
     bellman_errors,
     dual_gradient,
     dual_hessian,
@@ -388,6 +391,8 @@ def test_an_optimum_at_a_tiny_floor_is_recognised_with_many_features(seed: int) 
     assert found.kl < problem.kl_bound
     assert found.eta == pytest.approx(TINY_FLOOR, rel=1e-9)
     assert found.outcome is Outcome.AT_FLOOR
+    # a temperature that did not wait for theta took 125 to 146, with the fallback
+    assert found.iterations < 50
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1e8])
@@ -654,11 +659,13 @@ def test_the_solution_does_not_depend_on_where_the_solver_starts(seed: int) -> N
     )
     near = solve_dual(half)
     far = np.random.default_rng(seed).normal(size=7)
-    for start in [(near.eta, near.theta), (30.0, np.zeros(7)), (0.2, far)]:
-        found = solve_dual(problem, start=start)
-        assert_optimal(problem, found)
+    for eta, theta in [(near.eta, near.theta), (30.0, np.zeros(7)), (0.2, far)]:
+        end = _newton(problem, eta, theta, 80, eta_free=True)  # whether or not the start is better
+        assert end.converged
+        weights = sample_weights(problem.bellman_errors(end.theta), end.eta)
         # What the tolerance of the KL bound leaves open; measured: up to 4e-5.
-        np.testing.assert_allclose(found.weights, cold.weights, atol=1e-4 * cold.weights.max())
+        np.testing.assert_allclose(weights, cold.weights, atol=1e-4 * cold.weights.max())
+    assert_optimal(problem, solve_dual(problem, start=(near.eta, near.theta)))
     assert solve_dual(problem, start=(cold.eta, cold.theta)).iterations == 0
 
 
@@ -681,8 +688,31 @@ def test_a_start_below_the_floor_begins_at_it() -> None:
 def test_the_floor_is_found_from_a_start_at_it_and_from_far_above_it() -> None:
     problem = floor_problem(0)
     cold = solve_dual(problem)
-    for start in [(cold.eta, cold.theta), (problem.eta_floor, 0.0 * cold.theta), (9.0, cold.theta)]:
-        found = solve_dual(problem, start=start)
-        assert found.outcome is Outcome.AT_FLOOR
-        assert_optimal(problem, found)
-        np.testing.assert_allclose(found.weights, cold.weights, atol=1e-5)
+    assert cold.outcome is Outcome.AT_FLOOR
+    at_it, above = (problem.eta_floor, 0.0 * cold.theta), (9.0, cold.theta)
+    for eta, theta in [(cold.eta, cold.theta), at_it, above]:
+        end = _newton(problem, eta, theta, 80, eta_free=True)
+        assert end.converged and end.eta == problem.eta_floor
+        weights = sample_weights(problem.bellman_errors(end.theta), end.eta)
+        np.testing.assert_allclose(weights, cold.weights, atol=1e-5)
+
+
+def test_a_temperature_that_was_too_low_is_left() -> None:
+    problem = random_problem(0)
+    wanted = solve_dual(problem)
+    assert wanted.outcome is Outcome.BOUND_ACTIVE
+    end = _newton(problem, problem.eta_floor + 0.05 * wanted.eta, wanted.theta, 80, eta_free=True)
+    assert end.converged
+    assert end.eta == pytest.approx(wanted.eta, rel=1e-3)
+
+
+def test_without_features_only_the_temperature_is_found() -> None:
+    rewards, _ = standardise(np.random.default_rng(0).normal(size=60))
+    found = solve_dual(DualProblem(rewards, np.zeros((60, 0)), 0.5, 0.1, 1e-6))
+    assert found.outcome is Outcome.BOUND_ACTIVE
+    assert found.kl == pytest.approx(0.5, abs=1e-4)
+
+
+def test_a_temperature_that_waits_is_never_done() -> None:
+    """`_newton` does not ask for the KL bound then: the decrement alone has to forbid it."""
+    assert CENTRED * ETA_LEAST > DECREMENT_TOLERANCE

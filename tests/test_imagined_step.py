@@ -604,8 +604,8 @@ def test_the_deviation_of_a_policy_can_be_less_and_its_mean_the_same() -> None:
     asked = 3.0 * rng.normal(size=(20, 2))
     for spread in (0.02, np.inf):
         wide, narrow = (
-            fit_policy(replace(samples, spread=spread), kernel, TASK, x, deviation)
-            for deviation in (1.0, 0.5)
+            fit_policy(replace(samples, spread=spread), kernel, TASK, x, widening)
+            for widening in (1.0, 0.5)
         )
         np.testing.assert_allclose(narrow.greedy(asked), wide.greedy(asked), atol=1e-9)
         np.testing.assert_allclose(

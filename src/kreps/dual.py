@@ -325,12 +325,13 @@ CENTRED = 0.01
 """Decrement, in units of eta, above which theta has to be mended before eta may move.
 
 ``exp(delta / eta)`` is nearly quadratic only where delta changes by less than eta.  A temperature
-that runs ahead of its theta leaves no step that is both long and downhill."""
+that runs ahead of its theta leaves no step that is both long and downhill.  (Times the least eta it
+exceeds `DECREMENT_TOLERANCE`: a run whose eta still waits is never done.)"""
 
 
 def solve_dual(
     problem: Problem,
-    max_iterations: int = 40,
+    max_iterations: int = 80,
     start: tuple[float, FloatArray] | None = None,
 ) -> DualSolution:
     """Minimise the dual over eta >= floor and theta: damped Newton, with bisection to fall back on.
@@ -346,7 +347,8 @@ def solve_dual(
     theta = np.zeros(problem.rank)
     if start is not None:
         given = max(start[0], problem.eta_floor), start[1]
-        if dual_value(problem, *given) <= dual_value(problem, eta, theta):
+        nothing = eta * (problem.kl_bound + float(np.log(np.mean(np.exp(problem.rewards / eta)))))
+        if dual_value(problem, *given) <= nothing:
             eta, theta = given
     end = _newton(problem, eta, theta, max_iterations, eta_free=True)
     outcome = Outcome.BOUND_ACTIVE
@@ -411,8 +413,8 @@ def _newton(
         if _done(problem, g_eta if moves_eta else 0.0, g_theta, decrement):
             return _Progress(eta, theta, here, decrement, iteration, jitter, True)
         # eta at most halves or doubles, and never passes its floor
-        allowed = min(max(stretch, 0.5 - 1.0, floor / eta - 1.0), 2.0 - 1.0)
-        length = 1.0 if allowed == stretch else allowed / stretch
+        most = 1.0 if stretch > 0.0 else max(0.5, floor / eta) - 1.0
+        length = min(1.0, most / stretch) if stretch else 1.0
         rounding = 1e-14 * max(1.0, abs(value))
         # The first try is good enough where the one before was, so its curvature is taken in the
         # same pass; but where it should be the last, converging as fast as before, none is needed.
@@ -460,10 +462,10 @@ def _joint_step(
         g_eta: gradient in the scaled eta.
     """
     mixed, own = hessian[:-1, -1], float(hessian[-1, -1])
-    follows = factor.solve(mixed)  # minus how theta follows eta
-    complement = max(own - float(mixed @ follows), 1e-12 * own, np.finfo(float).tiny)
+    pulled = factor.solve(mixed)  # how far theta has to go back for eta
+    complement = max(own - float(mixed @ pulled), 1e-12 * own, 1e-300)
     stretch = -(g_eta + float(mixed @ step)) / complement
-    return step - stretch * follows, stretch
+    return step - stretch * pulled, stretch
 
 
 def _done(problem: Problem, g_eta: float, g_theta: FloatArray, decrement: float) -> bool:

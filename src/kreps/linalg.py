@@ -34,6 +34,8 @@ class Cholesky:
         """``A^-1 b`` for ``b`` of shape (n,) or (n, k)."""
         if not isinstance(b, np.ndarray):
             return solve_lower_transposed(self.lower, solve_lower(self.lower, b))
+        if not b.size:  # LAPACK would not have it
+            return b.copy()
         x, _ = lapack.dpotrs(self.lower, b, lower=1)
         return x
 

@@ -106,7 +106,7 @@ class Settings(OnPolicySettings):
         imagined: actions per state that are drawn anew for a second bounded step, in which the
             model says what they lead to; 0 leaves that step out.
         imagined_noise: these actions are drawn with so many times the deviation of the policy, and
-            the new one acts with so much less: in the model a wide guess costs nothing.
+            that of the policy fitted to them is divided by it.
         imagined_rollouts: share of these actions in states that the policy is led to in roll-outs
             simulated by the model ``"dynamics"``, the others in sampled states.  There are none in
             images, nor with fewer than ten samples for each coordinate of state and action.

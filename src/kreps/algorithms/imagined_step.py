@@ -4,8 +4,11 @@ The weights of Eq. 1 can only choose among the actions that happened to be taken
 A transition model predicts for *any* action, so more can be asked of the same roll-outs: in the
 states as the first step reweighted them, and in those that the model leads its policy to, actions
 are drawn from this policy, and the same convex problem is solved once more for them.  The KL bound
-then holds from that policy, so that old roll-outs no longer tie the new policy to the old ones that
-made them.
+then holds from what they were drawn from, so that old roll-outs no longer tie the new policy to the
+old ones that made them.
+
+What is compared in the model can be wide, and what is done in the world narrow: actions are drawn
+with more than the policy's deviation, and the one fitted to them acts with as much less of its own.
 """
 
 from __future__ import annotations
@@ -85,7 +88,7 @@ def imagine(
     ridge: float,
     rng: np.random.Generator,
 ) -> ImaginedSamples:
-    """Actions of the policy in states drawn by the weights (n,) and in states it is led to.
+    """Actions around the policy's in states drawn by the weights (n,) and in states it is led to.
 
     Args:
         outlook, weights: of n samples.

@@ -399,13 +399,13 @@ def fit_sparse(
     sums: PolicySums,
     x: FloatArray,
     noise: float,
-    deviation: float = 1.0,
+    widening: float = 1.0,
 ) -> SparseGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,) with a given noise.
+    """The policy at log hyper-parameters ``x`` (g + 2,), its deviation times ``widening``.
 
-    Its deviation is multiplied by ``deviation``; its mean stays.
+    Until then its actions are drawn with ``noise``.
     """
-    scale = deviation**2
+    scale = widening**2  # of signal and noise alike, so that the mean stays
     signal = scale * float(np.exp(x[-2]))
     return SparseGP.fit(task, centres, sums, signal=signal, noise=scale * noise)
 
