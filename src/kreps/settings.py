@@ -105,8 +105,6 @@ class Settings(OnPolicySettings):
             of the imagined roll-outs that begin there.  Real ones begin where the environment does.
         imagined: actions per state that are drawn anew for a second bounded step, in which the
             model says what they lead to; 0 leaves that step out.
-        imagined_noise: these actions are drawn with so many times the deviation of the policy, and
-            that of the policy fitted to them is divided by it.
         imagined_rollouts: share of these actions in states that the policy is led to in roll-outs
             simulated by the model ``"dynamics"``, the others in sampled states.  There are none in
             images, nor with fewer than ten samples for each coordinate of state and action.
@@ -133,7 +131,6 @@ class Settings(OnPolicySettings):
     ridge: float | None = None
     exploring_starts: float = 0.25
     imagined: int = 4
-    imagined_noise: float = 1.2
     imagined_rollouts: float = 0.5
     model: Model = "dynamics"
     features: Features = "rkhs"
@@ -155,7 +152,6 @@ class Settings(OnPolicySettings):
             self._check("ridge", Real, "positive and finite, or None", lambda v: 0 < v < inf)
         self._check("eta_floor", Real, "finite and >= 0", lambda v: 0 <= v < inf)
         self._check("exploring_starts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
-        self._check("imagined_noise", Real, "finite and >= 1", lambda v: 1 <= v < inf)
         self._check("imagined_rollouts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
         self._check("imagined", Integral, "a whole number >= 0", lambda v: v >= 0)
         self._whole("max_rank", "grid_size", "rank")

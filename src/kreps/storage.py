@@ -73,12 +73,7 @@ CHECKPOINT_ARRAYS = (
     }
 )
 ADDED_LATER: dict[str, dict[str, Any]] = {
-    "reps": {
-        "imagined": 0,
-        "exploring_starts": 0.0,
-        "imagined_noise": 1.0,
-        "imagined_rollouts": 0.0,
-    }
+    "reps": {"imagined": 0, "exploring_starts": 0.0, "imagined_rollouts": 0.0}
 }
 """Settings by method that earlier checkpoints have not, at the values that mean what these did."""
 

@@ -218,7 +218,7 @@ def update(
         centres = policy_centres(support, kernel, x, settings, rng)
         weights, noise = drawn_noise(support, float(np.exp(x[-1])))
         policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
-        policy = fit_sparse(task, centres, policy_sums, x, noise, 1.0 / settings.imagined_noise)
+        policy = fit_sparse(task, centres, policy_sums, x, noise)
         clock.lap("imagined step")
     bases.append(centres)
 
@@ -394,20 +394,10 @@ def policy_centres(
 
 
 def fit_sparse(
-    task: TaskSpec,
-    centres: RKHSBasis,
-    sums: PolicySums,
-    x: FloatArray,
-    noise: float,
-    widening: float = 1.0,
+    task: TaskSpec, centres: RKHSBasis, sums: PolicySums, x: FloatArray, noise: float
 ) -> SparseGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,), its deviation times ``widening``.
-
-    Until then its actions are drawn with ``noise``.
-    """
-    scale = widening**2  # of signal and noise alike, so that the mean stays
-    signal = scale * float(np.exp(x[-2]))
-    return SparseGP.fit(task, centres, sums, signal=signal, noise=scale * noise)
+    """The policy at log hyper-parameters ``x`` (g + 2,), its actions drawn with ``noise``."""
+    return SparseGP.fit(task, centres, sums, signal=float(np.exp(x[-2])), noise=noise)
 
 
 def solve(
