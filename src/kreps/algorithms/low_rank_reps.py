@@ -212,6 +212,7 @@ def update(
         )
         share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
+        # V is nearly known, the temperature is to be found anew: it may have to rise
         dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
         support = PolicySamples.imagined(imagined, dual.weights, task)
         x = policy_hyperparameters(support, kernel, settings, x, rng)
