@@ -347,6 +347,7 @@ def solve_dual(
     theta = np.zeros(problem.rank)
     if start is not None:
         given = max(start[0], problem.eta_floor), start[1]
+        # the dual where V is zero: delta is R, so it needs no pass over the features
         nothing = eta * (problem.kl_bound + float(np.log(np.mean(np.exp(problem.rewards / eta)))))
         if dual_value(problem, *given) <= nothing:
             eta, theta = given
