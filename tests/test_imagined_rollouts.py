@@ -1,8 +1,12 @@
-"""Roll-outs in the transition model: where they start, go and end, and what becomes of them."""
+"""Roll-outs in the transition model: where they start, go and end, and what becomes of them.
+
+And what policies earn in them: which of two acts on.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from math import ceil
 from typing import Any
 
 import numpy as np
@@ -12,8 +16,9 @@ import kreps
 from kreps import policies
 from kreps.algorithms import low_rank_reps, reps
 from kreps.algorithms.dynamics import TREND_SAMPLES, Dynamics, Motion, fit_dynamics
-from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
+from kreps.algorithms.imagined_rollouts import AVERAGED, Simulator, can_be_simulated
 from kreps.algorithms.imagined_step import Outlook, imagine
+from kreps.algorithms.judgement import judged_worse
 from kreps.algorithms.reps import UpdateInfo
 from kreps.algorithms.transition_model import feature_differences
 from kreps.arrays import FloatArray
@@ -376,3 +381,156 @@ def test_a_policy_is_followed_and_not_the_roll_outs() -> None:
     # pushed for long the speed would go to 4; no more is known than the most that was seen
     most = data.points[:, 1].max()
     assert right[:, 1].max() == pytest.approx(most, rel=0.3)
+
+
+# ---- what a policy earns in them --------------------------------------------------------------
+
+
+def angle(inputs: FloatArray) -> FloatArray:
+    return inputs[:, 0]
+
+
+def test_a_step_counts_by_the_chance_that_no_restart_came_before_it() -> None:
+    p = 0.1
+    steps = ceil(AVERAGED / p)
+    assert (1 - p) ** steps == pytest.approx(np.exp(-AVERAGED), rel=0.15)
+    made = simulator(restart_probability=p)
+    found = made.average_rewards(Push(1.0), angle, 40, np.random.default_rng(0))
+    share = p * (1 - p) ** np.arange(steps) / (1 - (1 - p) ** steps)
+    # each push turns the wheel by 0.05
+    wanted = STARTS[:, 0] + 0.05 * share @ np.arange(steps)
+    assert found.shape == (40,)
+    np.testing.assert_allclose(np.unique(np.round(found, 9)), np.sort(np.round(wanted, 9)))
+
+
+def test_reward_is_of_the_actions_as_they_are_applied() -> None:
+    made = simulator()
+    found = made.average_rewards(Push(50.0), lambda x: x[:, 2], 3, np.random.default_rng(0))
+    np.testing.assert_allclose(found, 1.0)
+
+
+def test_after_a_real_end_the_process_begins_again() -> None:
+    policy = Push()
+    made = simulator(end=1.0)
+    made.average_rewards(policy, angle, 30, np.random.default_rng(1))
+    assert len(policy.asked) == ceil(AVERAGED / made.restart_probability)
+    for states in policy.asked:
+        assert {tuple(s) for s in states} == {tuple(s) for s in STARTS}
+
+
+def test_the_same_chance_gives_the_same_rewards() -> None:
+    made = simulator(missed=1e-2, end=0.1)
+    once, again, other = (
+        made.average_rewards(Push(), angle, 20, np.random.default_rng(seed)) for seed in (0, 0, 1)
+    )
+    np.testing.assert_array_equal(once, again)
+    assert not np.array_equal(once, other)
+
+
+# ---- which of two acts on ---------------------------------------------------------------------
+
+
+class Fixed(Simulator):
+    """Policies earn what they push, give or take what the generator says."""
+
+    def average_rewards(
+        self, policy: Any, reward: Any, count: int, rng: np.random.Generator
+    ) -> FloatArray:
+        assert self.exploring_starts == 0.0
+        chance = rng.standard_normal(count)
+        return policy.force * (1.0 + policy.risk * chance) + 100.0 * chance
+
+
+class Risky(Push):
+    def __init__(self, force: float, risk: float = 0.0) -> None:
+        super().__init__(force)
+        self.risk = risk
+
+
+def judged(new: Any, before: Any, count: int = 100, seed: int = 0, **changes: Any) -> bool:
+    made = simulator(exploring_starts=0.5)
+    fixed = Fixed(**{name: getattr(made, name) for name in made.__dataclass_fields__})
+    outlook: Any = Outlook(
+        states=np.zeros((2, 2)),
+        features=np.zeros((2, 1)),
+        features_at=lambda states: states,
+        restart=np.zeros(1),
+        rewards=np.zeros(2),
+        expect=lambda rows, inputs: inputs,
+        reward=lambda inputs: inputs[:, :1],
+        simulator=fixed,
+    )
+    rng = np.random.default_rng(seed)
+    found = judged_worse(new, before, replace(outlook, **changes), count, rng)
+    np.testing.assert_array_equal(rng.uniform(), np.random.default_rng(seed).uniform())
+    return found
+
+
+def test_a_policy_that_earns_less_is_found_worse() -> None:
+    # the common chance is two hundred times as large as the difference
+    assert judged(Risky(1.0), Risky(1.5))
+    assert not judged(Risky(1.5), Risky(1.0))
+    assert not judged(Risky(1.0), Risky(1.0))
+
+
+def test_what_may_be_chance_is_not_held_against_it() -> None:
+    refused = [judged(Risky(1.0, 8.0), Risky(1.02), seed=seed) for seed in range(200)]
+    # the difference is 0.025 standard errors, so chance refuses about one in six
+    assert np.mean(refused) == pytest.approx(0.165, abs=0.08)
+
+
+def test_without_a_policy_before_or_a_simulator_each_is_taken() -> None:
+    assert not judged(Risky(1.0), None)
+    assert not judged(Risky(1.0), Risky(1.5), simulator=None)
+    assert not judged(Risky(1.0), Risky(1.5), count=0)
+
+
+# ---- in an update -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+def test_a_policy_that_is_found_worse_does_not_act(
+    approximation: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module: Any = reps if approximation == "exact" else low_rank_reps
+    asked: list[tuple[Any, Any, int]] = []
+    said = iter((False, True, False))
+
+    def judge(new: Any, before: Any, outlook: Any, count: int, rng: Any) -> bool:
+        asked.append((new, before, count))
+        return next(said)
+
+    monkeypatch.setattr(module, "judged_worse", judge)
+    learner = kreps.KREPS(TASK, approximation=approximation, judging_rollouts=7)
+    policies, infos = [], []
+    for seed in range(3):
+        info = learner.update(turns(seed=seed))
+        assert isinstance(info, UpdateInfo)
+        infos.append(info)
+        policies.append(learner.state.policy)
+    assert [info.kept for info in infos] == [False, True, False]
+    assert ["policy kept" in info.shown()["note"] for info in infos] == [False, True, False]
+    assert policies[1] is policies[0] and policies[2] is not policies[0]
+    assert [before for _, before, _ in asked] == [None, policies[0], policies[0]]
+    assert asked[1][0] is not policies[0] and asked[2][0] is policies[2]
+    assert {count for _, _, count in asked} == {7}
+
+
+def test_what_judges_is_what_the_update_expects(monkeypatch: pytest.MonkeyPatch) -> None:
+    outlook = outlook_of(turns(), monkeypatch)
+    inputs = np.random.default_rng(0).normal(size=(50, 3))
+    wild = replace(outlook, reward=lambda x: 1e3 * x[:, :1])
+    found = wild.rewards_of(inputs)
+    low, high = outlook.rewards.min(), outlook.rewards.max()
+    assert (found.min(), found.max()) == (low, high)
+    said = outlook.rewards.mean() + outlook.reward(inputs)[:, 0]
+    np.testing.assert_array_equal(outlook.rewards_of(inputs), np.clip(said, low, high))
+
+
+def test_a_learnt_model_tells_the_better_of_two_policies(monkeypatch: pytest.MonkeyPatch) -> None:
+    faster = [replace(r, rewards=r.observations[1:, 1]) for r in turns()]
+    outlook = outlook_of(faster, monkeypatch)
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        assert judged_worse(Push(0.8), Push(1.2), outlook, 20, rng)
+        assert not judged_worse(Push(1.2), Push(0.8), outlook, 20, rng)

@@ -91,6 +91,7 @@ def test_an_unknown_parameter_is_refused_with_the_choices() -> None:
         ],
         *[("ridge", value) for value in (0.0, -1.0, float("inf"), float("nan"), "1", True)],
         *[("imagined", value) for value in (-1, 2.5, 4.0, "4", True, None)],
+        *[("judging_rollouts", value) for value in (-1, 1, 2.5, 4.0, "4", True, None)],
         *[
             (name, value)
             for name in ("exploring_starts", "imagined_rollouts")
@@ -131,6 +132,8 @@ def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
         ("exploring_starts", 1.0),
         ("imagined_rollouts", 0),
         ("imagined_rollouts", 1.0),
+        ("judging_rollouts", 0),
+        ("judging_rollouts", 2),
         ("imagined", 1),
         ("model", "embedding"),
         ("features", "grid"),

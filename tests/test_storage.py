@@ -925,7 +925,12 @@ def test_checkpoints_of_before_a_setting_was_there_keep_their_meaning(
 ) -> None:
     file = files["reps checkpoint"]
     settings = {**file.header["settings"], **changes}
-    later = {"imagined": 0, "exploring_starts": 0.0, "imagined_rollouts": 0.0}
+    later = {
+        "imagined": 0,
+        "exploring_starts": 0.0,
+        "imagined_rollouts": 0.0,
+        "judging_rollouts": 0,
+    }
     for name in set(later) - set(changes):
         del settings[name]
     path = forge(tmp_path / "old", file.tensors, {**file.header, "settings": settings})

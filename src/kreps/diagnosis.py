@@ -38,6 +38,9 @@ BOUND_USED, BOUND_UNUSED = 0.8, 0.5
 LEAST_EFFECTIVE, LEAST_SHARE = 30.0, 0.05
 """Effective targets that a policy can be fitted to, and effective samples as a share of all."""
 
+KEPT_NOTE = 0.5
+"""Share of new policies that the model finds worse above which learning hardly goes on."""
+
 CLIPPED_NOTE = 0.9
 """Share of commands beyond the limits above which exploration is hardly felt."""
 
@@ -180,6 +183,7 @@ def diagnose(
         progress(rows, evaluation, references),
         step(rows),
         effective_samples(rows),
+        judgement(rows),
         model(rows),
         basis(rows),
         noise(rows, evaluation),
@@ -468,6 +472,26 @@ def effective_samples(rows: Sequence[Row]) -> Finding:
         count,
         LEAST_EFFECTIVE,
         f"The weights rest on {count:.0f} effective samples, {share:.0%} of all.",
+    )
+
+
+def judgement(rows: Sequence[Row]) -> Finding | None:
+    """Whether new policies pass the model's judgement; None if that was not recorded."""
+    name = "judgement"
+    share = recent(rows, "kept")
+    if not np.isfinite(share):
+        return None
+    said = f"Of the latest updates the model found {share:.0%} worse than the policy before"
+    if share <= KEPT_NOTE:
+        return Finding(name, "fine", share, KEPT_NOTE, f"{said}.")
+    return Finding(
+        name,
+        "note",
+        share,
+        KEPT_NOTE,
+        f"{said}, which acts on: what V promises, roll-outs in the model do not keep.",
+        "nothing, if the reward is good enough; else more data for each update "
+        "(--set rollouts_per_iteration=20 --set window=60).",
     )
 
 

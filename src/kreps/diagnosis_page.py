@@ -31,7 +31,7 @@ WIDTH, HEIGHT, WORDS = 14.0, 8.8, 5.1
 """Of the page and of its column of words, in inches."""
 
 PANELS: dict[str, tuple[str, ...]] = {
-    "Average reward per step, and its trend": ("goal", "local optimum", "progress"),
+    "Average reward per step, and its trend": ("goal", "local optimum", "progress", "judgement"),
     "KL divergence [nats]": ("step",),
     "Temperature eta [s.d. of the reward]": ("step", "updates"),
     "Effective samples, share of all": ("effective samples",),

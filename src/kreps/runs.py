@@ -39,9 +39,11 @@ STAGES = (
     "policy fit",
     "policy",
     "imagined step",
+    "judgement",
 )
 NEWER = (
     "cpu_seconds_imagined_step",
+    "cpu_seconds_judgement",
     "weighted",
     "model_error",
     "clipped",
@@ -50,6 +52,7 @@ NEWER = (
     "max_rank",
     "ridge",
     "exploring",
+    "kept",
 )
 """Columns that runs of earlier versions have not.  There they are NaN, as is the error where there
 is no model, and the cap where the features of V are of a fixed number."""
@@ -75,7 +78,7 @@ COLUMNS = (
     "newton_iterations",
     "outcome",
     "jitter",
-    *(f"cpu_seconds_{stage.replace(' ', '_')}" for stage in STAGES[:-1]),
+    *(f"cpu_seconds_{stage.replace(' ', '_')}" for stage in STAGES[:-2]),
     *NEWER,
 )
 
@@ -267,5 +270,6 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "max_rank": rank_cap(learner.settings),
         "ridge": info.ridge,
         "exploring": float(learner.exploring),
+        "kept": float(info.kept),
         **{f"cpu_seconds_{s.replace(' ', '_')}": round(seconds.get(s, 0.0), 5) for s in STAGES},
     }

@@ -108,6 +108,8 @@ class Settings(OnPolicySettings):
         imagined_rollouts: share of these actions in states that the policy is led to in roll-outs
             simulated by the model ``"dynamics"``, the others in sampled states.  There are none in
             images, nor with fewer than ten samples for each coordinate of state and action.
+        judging_rollouts: simulated likewise, of the new policy and of the one before, which acts on
+            if the new one earns less by more than the standard error; 0 takes every new one.
         model: transition model: ``"dynamics"`` regresses how the state changes, after a linear
             trend, and takes the features of V where that leads; ``"change"`` embeds how the
             features change, so that far from the data the state stays; ``"embedding"`` embeds the
@@ -132,6 +134,7 @@ class Settings(OnPolicySettings):
     exploring_starts: float = 0.25
     imagined: int = 4
     imagined_rollouts: float = 0.5
+    judging_rollouts: int = 100
     model: Model = "dynamics"
     features: Features = "rkhs"
     grid_size: int = 10
@@ -153,6 +156,8 @@ class Settings(OnPolicySettings):
         self._check("eta_floor", Real, "finite and >= 0", lambda v: 0 <= v < inf)
         self._check("exploring_starts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
         self._check("imagined_rollouts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
+        none_or_some = "0, or a whole number >= 2"
+        self._check("judging_rollouts", Integral, none_or_some, lambda v: v == 0 or v >= 2)
         self._check("imagined", Integral, "a whole number >= 0", lambda v: v >= 0)
         self._whole("max_rank", "grid_size", "rank")
         if self.model == "sample" and (self.imagined or self.ridge is None):

@@ -73,7 +73,12 @@ CHECKPOINT_ARRAYS = (
     }
 )
 ADDED_LATER: dict[str, dict[str, Any]] = {
-    "reps": {"imagined": 0, "exploring_starts": 0.0, "imagined_rollouts": 0.0}
+    "reps": {
+        "imagined": 0,
+        "exploring_starts": 0.0,
+        "imagined_rollouts": 0.0,
+        "judging_rollouts": 0,
+    }
 }
 """Settings by method that earlier checkpoints have not, at the values that mean what these did."""
 

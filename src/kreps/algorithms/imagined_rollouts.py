@@ -2,20 +2,28 @@
 
 The weights of the first step say where the new policy will be, but only among the states that old
 policies were in.  On its own way, and just beside it, nothing would say what to do.  The dynamics
-know where it leads, so a part of the second step's actions is imagined there.
+know where it leads, so a part of the second step's actions is imagined there.  And what the policy
+of the second step earns can be foretold before it acts: see `kreps.algorithms.judgement`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from math import ceil
 
 import numpy as np
 
 from kreps.algorithms.dynamics import TREND_SAMPLES, Dynamics
-from kreps.arrays import FloatArray, IntArray
+from kreps.arrays import BoolArray, FloatArray, IntArray
 from kreps.data import TaskSpec, Transitions
 from kreps.kernels import Kernel
 from kreps.policies import StochasticPolicy
+
+AVERAGED = 2.0
+"""Steps that an average reward is taken over, in mean lengths of a roll-out: one in seven has not
+been restarted by then."""
 
 
 def can_be_simulated(data: Transitions, task: TaskSpec) -> bool:
@@ -65,26 +73,64 @@ class Simulator:
         left = left[: 1 + np.searchsorted(np.cumsum(left), count)]
         left[-1] -= left.sum() - count
         visited, nearest = [], []
-        sampled, (low, high) = self.data.states, self._range
         states = self._starts(len(left), rng)
         while len(states):
-            rows = np.argmax(self.kernel.gram(states, sampled), axis=1)
+            rows, _, successors, ended = self._step(policy, states, rng)
             visited.append(states)
             nearest.append(rows)
-            noise = rng.standard_normal((len(states), self.task.action_size))
-            actions = self.task.scaled(self.task.clip(policy.act(states, noise)))
-            inputs = np.concatenate([states, actions], axis=1)
-            successors, ends = self.dynamics.draw(rows, inputs, rng)
-            left = np.where(rng.uniform(size=len(ends)) < ends, 0, left - 1)
-            states, left = np.clip(successors, low, high)[left > 0], left[left > 0]
+            left = np.where(ended, 0, left - 1)
+            states, left = successors[left > 0], left[left > 0]
         return np.concatenate(visited), np.concatenate(nearest)
+
+    def average_rewards(
+        self,
+        policy: StochasticPolicy,
+        reward: Callable[[FloatArray], FloatArray],
+        count: int,
+        rng: np.random.Generator,
+    ) -> FloatArray:
+        """Average reward per step (count,) of a policy, from each of so many starts.
+
+        No random restarts are drawn: a step counts by the chance that there has been none yet.
+
+        Args:
+            policy: to be followed, with its noise.
+            reward: of states and scaled, applied actions (m, ds + da).
+            count: of the starts.
+            rng: of starts, noise and ends.
+        """
+        steps = ceil(AVERAGED / self.restart_probability)
+        share = (1.0 - self.restart_probability) ** np.arange(steps)
+        asked = []
+        states = self._starts(count, rng)
+        for _ in range(steps):
+            _, inputs, successors, ended = self._step(policy, states, rng)
+            asked.append(inputs)
+            states = np.where(ended[:, None], self._starts(count, rng), successors)
+        rewards = reward(np.concatenate(asked)).reshape(steps, count)
+        return share @ rewards / share.sum()
+
+    def _step(
+        self, policy: StochasticPolicy, states: FloatArray, rng: np.random.Generator
+    ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+        """One step from states (m, ds), real ends and random restarts left to the caller.
+
+        The nearest samples (m,), the states and applied actions (m, ds + da), successors (m, ds)
+        within the range of the data, and whether the task ended (m,).
+        """
+        rows = np.argmax(self.kernel.gram(states, self.data.states), axis=1)
+        noise = rng.standard_normal((len(states), self.task.action_size))
+        actions = self.task.scaled(self.task.clip(policy.act(states, noise)))
+        inputs = np.concatenate([states, actions], axis=1)
+        successors, ends = self.dynamics.draw(rows, inputs, rng)
+        return rows, inputs, np.clip(successors, *self._range), rng.uniform(size=len(ends)) < ends
 
     def _starts(self, count: int, rng: np.random.Generator) -> FloatArray:
         starts = self.data.points[rng.choice(self.data.start, count)]
         anywhere = self.data.states[rng.choice(len(self.data), count)]
         return np.where(rng.uniform(size=(count, 1)) < self.exploring_starts, anywhere, starts)
 
-    @property
+    @cached_property
     def _range(self) -> tuple[FloatArray, FloatArray]:
         """Least and largest state (ds,) seen: beyond them nothing is known that could stop one.
 

@@ -52,6 +52,14 @@ class Outlook:
     reward: Callable[[FloatArray], FloatArray]
     simulator: Simulator | None
 
+    def rewards_of(self, inputs: FloatArray) -> FloatArray:
+        """Expected rewards (m,), standardised, of states and scaled, applied actions (m, ds + da).
+
+        A regression may overshoot what was ever observed, and would be believed.
+        """
+        said = self.rewards.mean() + self.reward(inputs)[:, 0]
+        return np.clip(said, self.rewards.min(), self.rewards.max())
+
 
 @dataclass(frozen=True)
 class ImaginedSamples:
@@ -109,10 +117,7 @@ def imagine(
         features = np.concatenate([features, outlook.features_at(led)])
     actions = policy.act(states[of], rng.standard_normal((count, task.action_size)))
     inputs = np.concatenate([states[of], task.scaled(task.clip(actions))], axis=1)
-    # a regression may overshoot what was ever observed, and would be believed
-    observed = outlook.rewards
-    said = observed.mean() + outlook.reward(inputs)[:, 0]
-    rewards = np.clip(said, observed.min(), observed.max())
+    rewards = outlook.rewards_of(inputs)
     problem = DualProblem(
         rewards=rewards - rewards.max(),
         differences=feature_differences(

@@ -31,6 +31,7 @@ from kreps.algorithms.chunk_sums import (
 )
 from kreps.algorithms.dynamics import Dynamics, Motion, after_ends, observed_expectation
 from kreps.algorithms.imagined_step import Outlook, imagine
+from kreps.algorithms.judgement import judged_worse
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
     Expectation,
@@ -187,7 +188,7 @@ def update(
     clock.lap("policy")
 
     # the same once more, for other actions in the states of the sample and where they lead
-    reward_start = state.reward_start
+    reward_start, kept = state.reward_start, False
     if settings.imagined and expectation.of_actions is not None and seen is not None:
         inputs = state_actions(sample, task)
         targets = (rewards[sampled] - rewards[sampled].mean())[:, None]
@@ -221,12 +222,14 @@ def update(
         policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
         policy = fit_sparse(task, centres, policy_sums, x, noise)
         clock.lap("imagined step")
+        kept = judged_worse(policy, state.policy, outlook, settings.judging_rollouts, rng)
+        clock.lap("judgement")
     bases.append(centres)
 
     new_state = state.after_data(
         *(seen or (count, n)),
         window=window,
-        policy=policy,
+        policy=state.policy if kept else policy,
         value=basis.function(reward_unit * dual.theta),
         embedding_start=embedding_start,
         reward_start=reward_start,
@@ -249,6 +252,7 @@ def update(
         embedding_parameters=None if embedding_start is None else np.exp(embedding_start),
         policy_parameters=np.exp(x),
         noise=policy.noise,
+        kept=kept,
         jitter=max(
             dual.jitter,
             *jitters,

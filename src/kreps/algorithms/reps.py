@@ -12,6 +12,7 @@ import numpy as np
 from kreps.algorithms.dynamics import Dynamics, fit_dynamics, observed_expectation
 from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
+from kreps.algorithms.judgement import judged_worse
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
     feature_differences,
@@ -76,7 +77,9 @@ class UpdateInfo:
         state_lengthscales: of V's kernel.
         embedding_parameters, policy_parameters: fitted values (not logs): lengthscales, then
             lambda, or sf2 and l.  The former are those of the transition model, whichever it is.
-        noise: variance that actions are drawn with, in units of the action scale squared.
+        noise: variance that actions are drawn with, in units of the action scale squared, by the
+            fitted policy.
+        kept: whether the policy before acts on, as the model found the fitted one worse.
         jitter: largest jitter that a factorisation of this update needed; trial points of the
             hyper-parameter searches do not count.
         seconds: CPU seconds of this process by stage.
@@ -97,6 +100,7 @@ class UpdateInfo:
     embedding_parameters: FloatArray | None
     policy_parameters: FloatArray
     noise: float
+    kept: bool
     jitter: float
     seconds: dict[str, float]
 
@@ -117,6 +121,7 @@ class UpdateInfo:
             "ESS": f"{self.effective_samples:.0f}",
             "gap": f"{self.dual.gap:.0e}",
             "note": f"{_NOTES.get(self.dual.outcome, '')}"
+            + ("  found worse: policy kept" if self.kept else "")
             + (f"  jitter {self.jitter:.0e}" if self.jitter else ""),
         }
 
@@ -174,7 +179,7 @@ def update(
     clock.lap("policy")
 
     # the same once more, for other actions in these states and where they lead
-    reward_start = state.reward_start
+    reward_start, kept = state.reward_start, False
     if settings.imagined and expectation.of_actions is not None:
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
         targets = (rewards - rewards.mean())[:, None]
@@ -197,11 +202,13 @@ def update(
         policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
         policy = fit_policy(support, kernel, task, policy_x)
         clock.lap("imagined step")
+        kept = judged_worse(policy, state.policy, outlook, settings.judging_rollouts, rng)
+        clock.lap("judgement")
 
     new_state = state.after(
         rollouts,
         window,
-        policy=policy,
+        policy=state.policy if kept else policy,
         value=basis.function(reward_unit * dual.theta),
         embedding_start=expectation.parameters,
         reward_start=reward_start,
@@ -227,6 +234,7 @@ def update(
         ),
         policy_parameters=np.exp(policy_x),
         noise=policy.noise,
+        kept=kept,
         jitter=max(dual.jitter, policy.factor.jitter, *jitters),
         seconds=clock.seconds,
     )

@@ -113,6 +113,7 @@ METHODS: dict[str, Method] = {
 ABLATIONS: dict[str, Options] = {
     "no imagined step": {"imagined": 0},
     "no imagined roll-outs": {"imagined_rollouts": 0.0},
+    "each policy taken": {"judging_rollouts": 0},
     "no exploring starts": {"exploring_starts": 0.0},
     "one imagined action": {"imagined": 1},
     "ridge 0.1": {"ridge": 0.1},
