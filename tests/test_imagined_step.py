@@ -595,6 +595,61 @@ def test_actions_are_drawn_with_no_more_noise_than_they_spread_within_a_state() 
     np.testing.assert_array_equal(wide.standard_deviation(asked), fitted.standard_deviation(asked))
 
 
+def test_the_deviation_of_a_policy_can_be_less_and_its_mean_the_same() -> None:
+    rng = np.random.default_rng(0)
+    states, targets = rng.normal(size=(40, 2)), rng.normal(size=(40, 1))
+    kernel = Kernel((SquaredExponential((0,)), SquaredExponential((1,))), np.ones(2))
+    x = np.log([1.0, 1.0, 0.8, 0.5])
+    samples = PolicySamples(states, targets, rng.uniform(0.5, 1.0, size=40), 30.0, np.zeros(40))
+    asked = 3.0 * rng.normal(size=(20, 2))
+    for spread in (0.02, np.inf):
+        wide, narrow = (
+            fit_policy(replace(samples, spread=spread), kernel, TASK, x, widening)
+            for widening in (1.0, 0.5)
+        )
+        np.testing.assert_allclose(narrow.greedy(asked), wide.greedy(asked), atol=1e-9)
+        np.testing.assert_allclose(
+            narrow.standard_deviation(asked), 0.5 * wide.standard_deviation(asked), atol=1e-9
+        )
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+def test_actions_are_imagined_wider_and_then_taken_narrower(
+    approximation: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module: Any = reps if approximation == "exact" else low_rank_reps
+    drawn: list[FloatArray] = []
+    spreads: list[float] = []
+    of_imagined = PolicySamples.imagined
+
+    def watch(
+        outlook: Outlook, weights: FloatArray, policy: StochasticPolicy, *others: Any
+    ) -> ImaginedSamples:
+        found = imagine(outlook, weights, policy, *others)
+        states = found.states[found.of]
+        mean = policy.act(states, np.zeros((len(states), 1)))
+        deviation = policy.act(states, np.ones((len(states), 1))) - mean
+        drawn.append((found.actions - mean) / deviation)
+        return found
+
+    def samples(*arguments: Any) -> PolicySamples:
+        found = of_imagined(*arguments)
+        spreads.append(found.spread)
+        return found
+
+    monkeypatch.setattr(module, "imagine", watch)
+    monkeypatch.setattr(PolicySamples, "imagined", samples)
+    for wider in (1.0, 1.7):
+        learner, info = updated(
+            pushes(), approximation=approximation, imagined=20, imagined_noise=wider
+        )
+        signal, fitted = info.policy_parameters[-2:]
+        assert learner.policy.process.signal == pytest.approx(signal / wider**2)
+        assert info.noise == pytest.approx(min(fitted, spreads[-1]) / wider**2)
+    np.testing.assert_allclose(drawn[1], 1.7 * drawn[0], atol=1e-6)
+    assert np.std(drawn[0]) == pytest.approx(1.0, rel=0.05)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_it_finds_actions_beyond_those_that_the_weights_can_choose_among(seed: int) -> None:
     """The reward is best at an action of 1, while those that were tried lie around -0.5."""

@@ -89,6 +89,10 @@ def test_an_unknown_parameter_is_refused_with_the_choices() -> None:
             for name in ("kl_bound", "exploration_scale", "basis_tolerance")
             for value in (0.0, -1.0, float("inf"), float("nan"), "1", True, None)
         ],
+        *[
+            ("imagined_noise", value)
+            for value in (0.99, 0.0, -1.0, float("inf"), float("nan"), "1", True, None)
+        ],
         *[("ridge", value) for value in (0.0, -1.0, float("inf"), float("nan"), "1", True)],
         *[("imagined", value) for value in (-1, 2.5, 4.0, "4", True, None)],
         *[("judging_rollouts", value) for value in (-1, 1, 2.5, 4.0, "4", True, None)],
@@ -130,6 +134,8 @@ def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
         ("imagined", 0),
         ("exploring_starts", 0.0),
         ("exploring_starts", 1.0),
+        ("imagined_noise", 1),
+        ("imagined_noise", 2.5),
         ("imagined_rollouts", 0),
         ("imagined_rollouts", 1.0),
         ("judging_rollouts", 0),

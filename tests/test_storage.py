@@ -928,6 +928,7 @@ def test_checkpoints_of_before_a_setting_was_there_keep_their_meaning(
     later = {
         "imagined": 0,
         "exploring_starts": 0.0,
+        "imagined_noise": 1.0,
         "imagined_rollouts": 0.0,
         "judging_rollouts": 0,
     }

@@ -105,6 +105,8 @@ class Settings(OnPolicySettings):
             of the imagined roll-outs that begin there.  Real ones begin where the environment does.
         imagined: actions per state that are drawn anew for a second bounded step, in which the
             model says what they lead to; 0 leaves that step out.
+        imagined_noise: these actions are drawn with so many times the deviation of the policy, and
+            that of the policy fitted to them is divided by it; where roll-outs can be simulated.
         imagined_rollouts: share of these actions in states that the policy is led to in roll-outs
             simulated by the model ``"dynamics"``, the others in sampled states.  There are none in
             images, nor with fewer than ten samples for each coordinate of state and action.
@@ -133,6 +135,7 @@ class Settings(OnPolicySettings):
     ridge: float | None = None
     exploring_starts: float = 0.25
     imagined: int = 4
+    imagined_noise: float = 1.2
     imagined_rollouts: float = 0.5
     judging_rollouts: int = 100
     model: Model = "dynamics"
@@ -155,6 +158,7 @@ class Settings(OnPolicySettings):
             self._check("ridge", Real, "positive and finite, or None", lambda v: 0 < v < inf)
         self._check("eta_floor", Real, "finite and >= 0", lambda v: 0 <= v < inf)
         self._check("exploring_starts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
+        self._check("imagined_noise", Real, "finite and >= 1", lambda v: 1 <= v < inf)
         self._check("imagined_rollouts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
         none_or_some = "0, or a whole number >= 2"
         self._check("judging_rollouts", Integral, none_or_some, lambda v: v == 0 or v >= 2)

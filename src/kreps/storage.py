@@ -76,6 +76,7 @@ ADDED_LATER: dict[str, dict[str, Any]] = {
     "reps": {
         "imagined": 0,
         "exploring_starts": 0.0,
+        "imagined_noise": 1.0,
         "imagined_rollouts": 0.0,
         "judging_rollouts": 0,
     }

@@ -4,8 +4,11 @@ The weights of Eq. 1 can only choose among the actions that happened to be taken
 A transition model predicts for *any* action, so more can be asked of the same roll-outs: in the
 states as the first step reweighted them, and in those that the model leads its policy to, actions
 are drawn from this policy, and the same convex problem is solved once more for them.  The KL bound
-then holds from that policy, so that old roll-outs no longer tie the new policy to the old ones that
-made them.
+then holds from what they were drawn from, so that old roll-outs no longer tie the new policy to the
+old ones that made them.
+
+What is compared in the model can be wide, and what is done in the world narrow: actions are drawn
+with more than the policy's deviation, and the one fitted to them acts with as much less of its own.
 """
 
 from __future__ import annotations
@@ -52,6 +55,14 @@ class Outlook:
     reward: Callable[[FloatArray], FloatArray]
     simulator: Simulator | None
 
+    def widening(self, settings: Settings) -> float:
+        """With how many deviations of a policy its actions are imagined: ``imagined_noise``.
+
+        One that then acts with as much less is soon sure of itself, so it has to be judged: where
+        nothing is simulated, 1.
+        """
+        return settings.imagined_noise if self.simulator is not None else 1.0
+
     def rewards_of(self, inputs: FloatArray) -> FloatArray:
         """Expected rewards (m,), standardised, of states and scaled, applied actions (m, ds + da).
 
@@ -93,14 +104,14 @@ def imagine(
     ridge: float,
     rng: np.random.Generator,
 ) -> ImaginedSamples:
-    """Actions of the policy in states drawn by the weights (n,) and in states it is led to.
+    """Actions around the policy's in states drawn by the weights (n,) and in states it is led to.
 
     Args:
         outlook, weights: of n samples.
         policy: to draw actions from.
         task: limits and scale of the actions.
-        settings: ``imagined`` draws a sample, up to `MOST_IMAGINED` in all; the share of them in
-            ``imagined_rollouts``; the bounds.
+        settings: ``imagined`` draws a sample, up to `MOST_IMAGINED` in all, with
+            ``imagined_noise``; the share of them in ``imagined_rollouts``; the bounds.
         ridge: rho times the number of draws.
         rng: of the draws.
     """
@@ -115,7 +126,8 @@ def imagine(
         rows = np.concatenate([rows, nearest])
         states = np.concatenate([states, led])
         features = np.concatenate([features, outlook.features_at(led)])
-    actions = policy.act(states[of], rng.standard_normal((count, task.action_size)))
+    noise = outlook.widening(settings) * rng.standard_normal((count, task.action_size))
+    actions = policy.act(states[of], noise)
     inputs = np.concatenate([states[of], task.scaled(task.clip(actions))], axis=1)
     rewards = outlook.rewards_of(inputs)
     problem = DualProblem(

@@ -220,7 +220,7 @@ def update(
         centres = policy_centres(support, kernel, x, settings, rng)
         weights, noise = drawn_noise(support, float(np.exp(x[-1])))
         policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
-        policy = fit_sparse(task, centres, policy_sums, x, noise)
+        policy = fit_sparse(task, centres, policy_sums, x, noise, 1.0 / outlook.widening(settings))
         clock.lap("imagined step")
         kept = judged_worse(policy, state.policy, outlook, settings.judging_rollouts, rng)
         clock.lap("judgement")
@@ -399,10 +399,20 @@ def policy_centres(
 
 
 def fit_sparse(
-    task: TaskSpec, centres: RKHSBasis, sums: PolicySums, x: FloatArray, noise: float
+    task: TaskSpec,
+    centres: RKHSBasis,
+    sums: PolicySums,
+    x: FloatArray,
+    noise: float,
+    widening: float = 1.0,
 ) -> SparseGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,), its actions drawn with ``noise``."""
-    return SparseGP.fit(task, centres, sums, signal=float(np.exp(x[-2])), noise=noise)
+    """The policy at log hyper-parameters ``x`` (g + 2,), its deviation times ``widening``.
+
+    Until then its actions are drawn with ``noise``.
+    """
+    scale = widening**2  # of signal and noise alike, so that the mean stays
+    signal = scale * float(np.exp(x[-2]))
+    return SparseGP.fit(task, centres, sums, signal=signal, noise=scale * noise)
 
 
 def solve(

@@ -44,7 +44,7 @@ DROPPED_WEIGHT = 0.05
 """Samples with ``n p_i`` below this do not enter the policy: they say next to nothing."""
 
 LEAST_NOISE = 1e-4
-"""Least variance of the drawn actions, in units of the action scale squared."""
+"""Least variance that actions are taken to spread with, in units of the action scale squared."""
 
 RIDGE_LEAST = 1e-3
 """Least ridge where the model asks for less: with a model without error V would follow the chance
@@ -77,6 +77,7 @@ class UpdateInfo:
         state_lengthscales: of V's kernel.
         embedding_parameters, policy_parameters: fitted values (not logs): lengthscales, then
             lambda, or sf2 and l.  The former are those of the transition model, whichever it is.
+            After a widened second step the policy has its sf2 and noise divided.
         noise: variance that actions are drawn with, in units of the action scale squared, by the
             fitted policy.
         kept: whether the policy before acts on, as the model found the fitted one worse.
@@ -200,7 +201,7 @@ def update(
         dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
         support = PolicySamples.imagined(imagined, dual.weights, task).heaviest(MAX_SUPPORT)
         policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
-        policy = fit_policy(support, kernel, task, policy_x)
+        policy = fit_policy(support, kernel, task, policy_x, 1.0 / outlook.widening(settings))
         clock.lap("imagined step")
         kept = judged_worse(policy, state.policy, outlook, settings.judging_rollouts, rng)
         clock.lap("judgement")
@@ -519,16 +520,21 @@ def drawn_noise(samples: PolicySamples, fitted: float) -> tuple[FloatArray, floa
 
 
 def fit_policy(
-    samples: PolicySamples, state_kernel: Kernel, task: TaskSpec, x: FloatArray
+    samples: PolicySamples,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    x: FloatArray,
+    widening: float = 1.0,
 ) -> CostSensitiveGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,)."""
+    """The policy at log hyper-parameters ``x`` (g + 2,), its deviation times ``widening``."""
     weights, noise = drawn_noise(samples, float(np.exp(x[-1])))
+    scale = widening**2  # of signal and noise alike, so that the mean stays
     return CostSensitiveGP(
         task,
         state_kernel.with_lengthscales(np.exp(x[:-2])),
         samples.states,
         samples.targets,
         weights,
-        signal=float(np.exp(x[-2])),
-        noise=noise,
+        signal=scale * float(np.exp(x[-2])),
+        noise=scale * noise,
     )
