@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from kreps.arrays import Array, FloatArray, as_numpy
-from kreps.kernels import Kernel
+from kreps.kernels import Kernel, gaussian_gram
 from kreps.linalg import Cholesky, cholesky, solve_lower, with_diagonal
 from kreps.value import Basis
 
@@ -87,12 +87,13 @@ class KernelEmbedding:
     def predictor(self, targets: FloatArray) -> Callable[[FloatArray], FloatArray]:
         """What is expected of targets (n, r) as a function of inputs (m, ds + da)."""
         solved = self.factor.solve(targets)
+        known = self.kernel.embed(self.inputs)
 
         def predict(inputs: FloatArray) -> FloatArray:
             expected = np.empty((len(inputs), *solved.shape[1:]))
             for first in range(0, len(inputs), ROWS):
                 block = slice(first, first + ROWS)
-                expected[block] = self.kernel.gram(inputs[block], self.inputs) @ solved
+                expected[block] = gaussian_gram(self.kernel.embed(inputs[block]), known) @ solved
             return expected
 
         return predict

@@ -118,12 +118,26 @@ class Simulator:
         The nearest samples (m,), the states and applied actions (m, ds + da), successors (m, ds)
         within the range of the data, and whether the task ended (m,).
         """
-        rows = np.argmax(self.kernel.gram(states, self.data.states), axis=1)
+        rows = self._nearest(states)
         noise = rng.standard_normal((len(states), self.task.action_size))
         actions = self.task.scaled(self.task.clip(policy.act(states, noise)))
         inputs = np.concatenate([states, actions], axis=1)
         successors, ends = self.dynamics.draw(rows, inputs, rng)
         return rows, inputs, np.clip(successors, *self._range), rng.uniform(size=len(ends)) < ends
+
+    @cached_property
+    def _samples(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean (e,) of the samples' coordinates, distances (n, e) from it, half their squares."""
+        coordinates = self.kernel.embed(self.data.states)
+        mean = coordinates.mean(axis=0)
+        centred = coordinates - mean
+        return mean, centred, 0.5 * np.sum(centred * centred, axis=1)
+
+    def _nearest(self, states: FloatArray) -> IntArray:
+        """Sample numbers (m,): ``argmin |e_i - f_j|^2`` is ``argmax e_i'f_j - |f_j|^2 / 2``."""
+        mean, centred, half_squares = self._samples
+        inner = (self.kernel.embed(states) - mean) @ centred.T
+        return np.argmax(inner - half_squares, axis=1)
 
     def _starts(self, count: int, rng: np.random.Generator) -> FloatArray:
         starts = self.data.points[rng.choice(self.data.start, count)]
