@@ -56,7 +56,8 @@ class EmbeddingLoss:
         squares = np.einsum("ij,ij->i", e, e)
         total = max(float(squares.sum()), 1e-200)  # nothing to predict: a state that never moves
         # d total = 2 <dC, M>: de_i = -[C^-1 dC a]_i / d_i + e_i [C^-1 dC C^-1]_ii / d_i
-        m = ((inverse * (squares / d)) - a @ (e / d[:, None]).T) @ inverse
+        half = inverse * np.sqrt(squares / d)
+        m = half @ half.T - a @ ((e / d[:, None]).T @ inverse)
         weighted = m * gram
         gradient = [
             2.0 * np.einsum("ij,ij->", weighted, distance) * np.exp(-2.0 * log_l)
