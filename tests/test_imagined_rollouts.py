@@ -245,18 +245,22 @@ def test_a_share_of_the_actions_is_drawn_along_them(
 
 
 def outlook_of(
-    rollouts: list[Rollout], monkeypatch: pytest.MonkeyPatch, **settings: Any
+    rollouts: list[Rollout],
+    monkeypatch: pytest.MonkeyPatch,
+    module: Any = reps,
+    approximation: str = "exact",
+    **settings: Any,
 ) -> Outlook:
-    """What the exact update sees, of roll-outs of any width."""
+    """What an update sees, of roll-outs of any width."""
     outlooks: list[Outlook] = []
 
     def watch(outlook: Outlook, *others: Any) -> Any:
         outlooks.append(outlook)
         return imagine(outlook, *others)
 
-    monkeypatch.setattr(reps, "imagine", watch)
+    monkeypatch.setattr(module, "imagine", watch)
     task = settings.pop("task", TASK)
-    kreps.KREPS(task, approximation="exact", **settings).update(rollouts)
+    kreps.KREPS(task, approximation=approximation, **settings).update(rollouts)
     [outlook] = outlooks
     return outlook
 
@@ -457,7 +461,7 @@ def judged(new: Any, before: Any, count: int = 100, seed: int = 0, **changes: An
         restart=np.zeros(1),
         rewards=np.zeros(2),
         expect=lambda rows, inputs: inputs,
-        reward=lambda inputs: inputs[:, :1],
+        reward=lambda inputs: inputs[:, :2],
         simulator=fixed,
     )
     rng = np.random.default_rng(seed)
@@ -519,12 +523,27 @@ def test_a_policy_that_is_found_worse_does_not_act(
 def test_what_judges_is_what_the_update_expects(monkeypatch: pytest.MonkeyPatch) -> None:
     outlook = outlook_of(turns(), monkeypatch)
     inputs = np.random.default_rng(0).normal(size=(50, 3))
-    wild = replace(outlook, reward=lambda x: 1e3 * x[:, :1])
-    found = wild.rewards_of(inputs)
+    wild = replace(outlook, reward=lambda x: 1e3 * x[:, :2])
     low, high = outlook.rewards.min(), outlook.rewards.max()
-    assert (found.min(), found.max()) == (low, high)
+    for found in (wild.rewards_of(inputs), wild.cautious_rewards_of(inputs)):
+        assert (found.min(), found.max()) == (low, high)
     said = outlook.rewards.mean() + outlook.reward(inputs)[:, 0]
     np.testing.assert_array_equal(outlook.rewards_of(inputs), np.clip(said, low, high))
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+def test_what_is_not_known_is_judged_as_the_worst_that_was(
+    approximation: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module: Any = reps if approximation == "exact" else low_rank_reps
+    outlook = outlook_of(turns(), monkeypatch, module, approximation=approximation)
+    seen = np.column_stack([outlook.states, np.zeros(len(outlook.states))])
+    assert np.abs(outlook.cautious_rewards_of(seen) - outlook.rewards_of(seen)).max() < 0.05
+    unseen = seen + np.array([0.0, 1e3, 0.0])
+    np.testing.assert_allclose(outlook.rewards_of(unseen), outlook.rewards.mean(), atol=1e-9)
+    np.testing.assert_allclose(
+        outlook.cautious_rewards_of(unseen), outlook.rewards.min(), atol=1e-9
+    )
 
 
 def test_a_learnt_model_tells_the_better_of_two_policies(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -137,7 +137,7 @@ class Settings(OnPolicySettings):
     imagined: int = 4
     imagined_noise: float = 1.2
     imagined_rollouts: float = 0.5
-    judging_rollouts: int = 100
+    judging_rollouts: int = 50
     model: Model = "dynamics"
     features: Features = "rkhs"
     grid_size: int = 10

@@ -4,6 +4,10 @@ An update goes wrong where an error of V meets one of the model: one step ahead 
 better than any other, and nothing asks what comes of a hundred of them.  Roll-outs in the model do,
 and they know nothing of V.  So a new policy is followed there beside the one before, from the same
 starts and with the same noise, and if it earns less the one before acts once more.
+
+Of states that no sample is like, the model would say that rewards are as they are on average, which
+late in learning is good.  A policy that goes there on purpose was never seen to: the judge takes
+what is not known for the worst that was.
 """
 
 from __future__ import annotations
@@ -36,7 +40,7 @@ def judged_worse(
         return False
     process = replace(outlook.simulator, exploring_starts=0.0)
     earned, before_earned = (
-        process.average_rewards(policy, outlook.rewards_of, count, deepcopy(rng))
+        process.average_rewards(policy, outlook.cautious_rewards_of, count, deepcopy(rng))
         for policy in (new, before)
     )
     gain = earned - before_earned
