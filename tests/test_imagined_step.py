@@ -479,7 +479,7 @@ def test_a_sample_says_what_it_would_say_if_all_samples_were_like_it(
     learner, _ = updated(pushes() * copies, approximation="pivoted", window=None)
     (moves, _), (rewards, of_part) = fits
     assert moves.product.shape[1] == 3  # two coordinates, and whether the task ended
-    assert rewards.product.shape[1] == 2
+    assert rewards.product.shape[1] == 1
     # a quarter of the samples, and a quarter of their noise, make the same regression
     assert learner.state.reward_start is not None
     assert of_part == pytest.approx(np.exp(learner.state.reward_start[-1]) / copies)

@@ -86,28 +86,34 @@ class Simulator:
         self,
         policy: StochasticPolicy,
         reward: Callable[[FloatArray], FloatArray],
+        least: float,
         count: int,
         rng: np.random.Generator,
     ) -> FloatArray:
         """Average reward per step (count,) of a policy, from each of so many starts.
 
         No random restarts are drawn: a step counts by the chance that there has been none yet.
+        And what is not known is the worst: the less a state is like any sample, the nearer its
+        reward is taken to be to the least one.
 
         Args:
             policy: to be followed, with its noise.
             reward: of states and scaled, applied actions (m, ds + da).
+            least: of all rewards.
             count: of the starts.
             rng: of starts, noise and ends.
         """
         steps = ceil(AVERAGED / self.restart_probability)
         share = (1.0 - self.restart_probability) ** np.arange(steps)
-        asked = []
+        asked, known = [], []
         states = self._starts(count, rng)
         for _ in range(steps):
-            _, inputs, successors, ended = self._step(policy, states, rng)
+            rows, inputs, successors, ended = self._step(policy, states, rng)
             asked.append(inputs)
+            known.append(self._likeness(states, rows))
             states = np.where(ended[:, None], self._starts(count, rng), successors)
-        rewards = reward(np.concatenate(asked)).reshape(steps, count)
+        expected = reward(np.concatenate(asked)).reshape(steps, count)
+        rewards = least + np.array(known) * (expected - least)
         return share @ rewards / share.sum()
 
     def _step(
@@ -138,6 +144,12 @@ class Simulator:
         mean, centred, half_squares = self._samples
         inner = (self.kernel.embed(states) - mean) @ centred.T
         return np.argmax(inner - half_squares, axis=1)
+
+    def _likeness(self, states: FloatArray, rows: IntArray) -> FloatArray:
+        """Kernel values (m,) of states (m, ds) with the samples (m,)."""
+        mean, centred, _ = self._samples
+        apart = self.kernel.embed(states) - mean - centred[rows]
+        return np.exp(-0.5 * np.sum(apart * apart, axis=1))
 
     def _starts(self, count: int, rng: np.random.Generator) -> FloatArray:
         starts = self.data.points[rng.choice(self.data.start, count)]

@@ -42,7 +42,7 @@ class Outlook:
         rewards: (n,) observed, standardised.
         expect: expected features (m, r) of the successor, of the samples (m,) that states are of
             or, if simulated, nearest to, and of states and scaled, applied actions (m, ds + da).
-        reward: what is to be expected of `reward_targets` (m, 2) in such states and actions.
+        reward: what reward (m, 1) is to be expected of such states and actions, from its mean.
         simulator: tells where a policy leads; None if the model does not.
     """
 
@@ -66,19 +66,10 @@ class Outlook:
     def rewards_of(self, inputs: FloatArray) -> FloatArray:
         """Expected rewards (m,), standardised, of states and scaled, applied actions (m, ds + da).
 
-        Far from all samples it is their mean.
+        A regression may overshoot what was ever observed, and would be believed.
         """
-        return self._within(self.rewards.mean() + self.reward(inputs)[:, 0])
-
-    def cautious_rewards_of(self, inputs: FloatArray) -> FloatArray:
-        """The same, but far from all samples it is their least."""
-        expected, known = self.reward(inputs).T
-        mean, least = self.rewards.mean(), self.rewards.min()
-        return self._within(mean + expected - (1.0 - known) * (mean - least))
-
-    def _within(self, rewards: FloatArray) -> FloatArray:
-        """A regression may overshoot what was ever observed, and would be believed."""
-        return np.clip(rewards, self.rewards.min(), self.rewards.max())
+        said = self.rewards.mean() + self.reward(inputs)[:, 0]
+        return np.clip(said, self.rewards.min(), self.rewards.max())
 
 
 @dataclass(frozen=True)
@@ -96,14 +87,6 @@ class ImaginedSamples:
     of: IntArray
     actions: FloatArray
     problem: DualProblem
-
-
-def reward_targets(rewards: FloatArray) -> FloatArray:
-    """What is regressed of rewards (n,), (n, 2): rewards from their mean, and ones.
-
-    A kernel regression fades to zero far from its samples.  What is left of the ones tells how far.
-    """
-    return np.column_stack([rewards - rewards.mean(), np.ones(len(rewards))])
 
 
 def resample(p: FloatArray, count: int, rng: np.random.Generator) -> IntArray:

@@ -40,7 +40,9 @@ def judged_worse(
         return False
     process = replace(outlook.simulator, exploring_starts=0.0)
     earned, before_earned = (
-        process.average_rewards(policy, outlook.cautious_rewards_of, count, deepcopy(rng))
+        process.average_rewards(
+            policy, outlook.rewards_of, outlook.rewards.min(), count, deepcopy(rng)
+        )
         for policy in (new, before)
     )
     gain = earned - before_earned

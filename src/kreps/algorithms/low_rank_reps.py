@@ -30,7 +30,7 @@ from kreps.algorithms.chunk_sums import (
     Successors,
 )
 from kreps.algorithms.dynamics import Dynamics, Motion, after_ends, observed_expectation
-from kreps.algorithms.imagined_step import Outlook, imagine, reward_targets
+from kreps.algorithms.imagined_step import Outlook, imagine
 from kreps.algorithms.judgement import judged_worse
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
@@ -191,9 +191,9 @@ def update(
     reward_start, kept = state.reward_start, False
     if settings.imagined and expectation.of_actions is not None and seen is not None:
         inputs = state_actions(sample, task)
-        targets = reward_targets(rewards[sampled])
+        targets = (rewards[sampled] - rewards[sampled].mean())[:, None]
         reward_kernel, regulariser, reward_start = embedding_hyperparameters(
-            inputs, targets[:, :1], kernel, task, reward_start, rng
+            inputs, targets, kernel, task, reward_start, rng
         )
         embedded = choose_basis(reward_kernel, inputs, settings, settings.rank, rng)
         bases.append(embedded)

@@ -11,7 +11,7 @@ import numpy as np
 
 from kreps.algorithms.dynamics import Dynamics, fit_dynamics, observed_expectation
 from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
-from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine, reward_targets
+from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
 from kreps.algorithms.judgement import judged_worse
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
@@ -183,10 +183,8 @@ def update(
     reward_start, kept = state.reward_start, False
     if settings.imagined and expectation.of_actions is not None:
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
-        targets = reward_targets(rewards)
-        regression, reward_start = fit_embedding(
-            data, targets[:, :1], kernel, task, reward_start, rng
-        )
+        targets = (rewards - rewards.mean())[:, None]
+        regression, reward_start = fit_embedding(data, targets, kernel, task, reward_start, rng)
         jitters.append(regression.factor.jitter)
         outlook = Outlook(
             states=data.states,
