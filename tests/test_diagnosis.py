@@ -63,7 +63,7 @@ HEALTHY: dict[str, Any] = {
     "max_rank": 400,
     "ridge": 0.02,
     "exploring": 0.0,
-    "kept": 0.0,
+    "refused": 0.0,
 }
 
 
@@ -320,11 +320,11 @@ def test_causes_without_numbers_are_left_out() -> None:
 
 
 def test_policies_that_the_model_refuses_are_counted() -> None:
-    kept = [1.0] * 7 + [0.0, 1.0, 0.0, 0.0, 1.0]
-    assert finding("judgement", kept=kept).value == pytest.approx(0.4)
-    assert finding("judgement", kept=kept).severity == "fine"
-    refused = finding("judgement", kept=1.0)
-    assert refused.severity == "note" and "100%" in refused.sentence and refused.remedy
+    refused = [1.0] * 7 + [0.0, 1.0, 0.0, 0.0, 1.0]
+    assert finding("judgement", refused=refused).value == pytest.approx(0.4)
+    assert finding("judgement", refused=refused).severity == "fine"
+    found = finding("judgement", refused=1.0)
+    assert found.severity == "note" and "100%" in found.sentence and found.remedy
 
 
 def test_the_share_is_of_the_samples_that_were_given_weights() -> None:
@@ -416,7 +416,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         clipped=0.25,
         eta_floor=0.1,
         ridge=0.03,
-        kept=True,
+        refused=True,
         seconds={},
     )
     learner: Any = SimpleNamespace(settings=Settings(max_rank=70), exploring=True)
@@ -427,7 +427,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
     assert set(row) == set(COLUMNS) and row["weighted"] == 4000
     assert row["policy_noise"] == pytest.approx(0.3) and row["max_rank"] == 70
     assert row["clipped"] == 0.25 and row["eta_floor"] == 0.1 and np.isnan(row["model_error"])
-    assert row["ridge"] == 0.03 and row["exploring"] == 1.0 and row["kept"] == 1.0
+    assert row["ridge"] == 0.03 and row["exploring"] == 1.0 and row["refused"] == 1.0
 
 
 def test_a_goal_that_was_not_reached_is_the_limit() -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from math import ceil
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,9 +17,9 @@ import kreps
 from kreps import policies
 from kreps.algorithms import low_rank_reps, reps
 from kreps.algorithms.dynamics import TREND_SAMPLES, Dynamics, Motion, fit_dynamics
-from kreps.algorithms.imagined_rollouts import AVERAGED, Simulator, can_be_simulated
+from kreps.algorithms.imagined_rollouts import AVERAGED, Followed, Simulator, can_be_simulated
 from kreps.algorithms.imagined_step import Outlook, imagine
-from kreps.algorithms.judgement import judged_worse
+from kreps.algorithms.judgement import refuses
 from kreps.algorithms.reps import UpdateInfo
 from kreps.algorithms.transition_model import feature_differences
 from kreps.arrays import FloatArray
@@ -394,12 +395,25 @@ ALIKE = Kernel(TASK.state_factors, np.array([1e9, 1e9]))
 """To which all states are the same."""
 
 
+def averaged(
+    made: Simulator,
+    policy: Any,
+    reward: Any,
+    count: int,
+    seed: int = 0,
+    least: float = -9.0,
+    typical: float = 1.0,
+) -> FloatArray:
+    followed = made.follow(policy, reward, count, np.random.default_rng(seed))
+    return followed.average_reward(made.restart_probability, least, typical)
+
+
 def test_a_step_counts_by_the_chance_that_no_restart_came_before_it() -> None:
     p = 0.1
     steps = ceil(AVERAGED / p)
     assert (1 - p) ** steps == pytest.approx(np.exp(-AVERAGED), rel=0.15)
     made = simulator(restart_probability=p, kernel=ALIKE)
-    found = made.average_rewards(Push(1.0), angle, -9.0, 40, np.random.default_rng(0))
+    found = averaged(made, Push(1.0), angle, 40)
     share = p * (1 - p) ** np.arange(steps) / (1 - (1 - p) ** steps)
     # each push turns the wheel by 0.05
     wanted = STARTS[:, 0] + 0.05 * share @ np.arange(steps)
@@ -407,43 +421,52 @@ def test_a_step_counts_by_the_chance_that_no_restart_came_before_it() -> None:
     np.testing.assert_allclose(np.unique(np.round(found, 9)), np.sort(np.round(wanted, 9)))
 
 
+def test_none_is_followed_for_longer_than_the_longest_that_was_seen() -> None:
+    policy = Push()
+    made = simulator(restart_probability=1e-6, longest=7)
+    followed = made.follow(policy, angle, 4, np.random.default_rng(0))
+    assert len(policy.asked) == 7
+    assert followed.rewards.shape == followed.likeness.shape == (7, 4)
+
+
 def test_reward_is_of_the_actions_as_they_are_applied() -> None:
-    made = simulator(kernel=ALIKE)
-    found = made.average_rewards(Push(50.0), lambda x: x[:, 2], -9.0, 3, np.random.default_rng(0))
-    np.testing.assert_allclose(found, 1.0)
+    np.testing.assert_allclose(
+        averaged(simulator(kernel=ALIKE), Push(50.0), lambda x: x[:, 2], 3), 1.0
+    )
 
 
 def test_after_a_real_end_the_process_begins_again() -> None:
     policy = Push()
     made = simulator(end=1.0)
-    made.average_rewards(policy, angle, 0.0, 30, np.random.default_rng(1))
+    averaged(made, policy, angle, 30)
     assert len(policy.asked) == ceil(AVERAGED / made.restart_probability)
     for states in policy.asked:
         assert {tuple(s) for s in states} == {tuple(s) for s in STARTS}
 
 
-def test_the_same_chance_gives_the_same_rewards() -> None:
-    made = simulator(missed=1e-2, end=0.1)
-    once, again, other = (
-        made.average_rewards(Push(), angle, -1.0, 20, np.random.default_rng(seed))
-        for seed in (0, 0, 1)
-    )
+def test_two_policies_meet_the_same_chance() -> None:
+    made = simulator(missed=1e-2, end=0.3)
+    once, again, other = (averaged(made, Push(), angle, 20, seed) for seed in (0, 0, 1))
     np.testing.assert_array_equal(once, again)
     assert not np.array_equal(once, other)
+    left = []
+    for force in (-2.0, 2.0):
+        rng = np.random.default_rng(0)
+        made.follow(Push(force), angle, 20, rng)
+        left.append(rng.uniform(size=3))
+    np.testing.assert_array_equal(*left)
 
 
 def test_what_is_not_known_is_the_worst() -> None:
     made = simulator(step=np.array([3.0, 0.0]), kernel=Kernel(TASK.state_factors, np.ones(2)))
     policy = Push(2.0)  # three radians a step, at a speed that is known
-    found = made.average_rewards(
-        policy, lambda x: np.full(len(x), 5.0), -7.0, 4, np.random.default_rng(0)
-    )
+    found = averaged(made, policy, lambda x: np.full(len(x), 5.0), 4, least=-7.0, typical=0.8)
     likeness = np.array(
         [made.kernel.gram(states, made.data.states).max(axis=1) for states in policy.asked]
     )
     assert likeness.min() < 0.6 and likeness.max() == pytest.approx(1.0)
     share = (1 - made.restart_probability) ** np.arange(len(likeness))
-    wanted = share @ (-7.0 + 12.0 * likeness) / share.sum()
+    wanted = share @ (-7.0 + 12.0 * np.minimum(likeness / 0.8, 1.0)) / share.sum()
     np.testing.assert_allclose(found, wanted)
 
 
@@ -453,21 +476,20 @@ def test_what_is_not_known_is_the_worst() -> None:
 class Fixed(Simulator):
     """Policies earn what they push, give or take what the generator says."""
 
-    def average_rewards(
-        self, policy: Any, reward: Any, least: float, count: int, rng: np.random.Generator
-    ) -> FloatArray:
+    def follow(self, policy: Any, reward: Any, count: int, rng: np.random.Generator) -> Followed:
         assert self.exploring_starts == 0.0
         chance = rng.standard_normal(count)
-        return policy.force * (1.0 + policy.risk * chance) + 100.0 * chance
+        rewards = policy.force * (1.0 + policy.risk * chance) + 100.0 * chance
+        return Followed(rewards[None], np.full((1, count), policy.likeness))
 
 
 class Risky(Push):
-    def __init__(self, force: float, risk: float = 0.0) -> None:
+    def __init__(self, force: float, risk: float = 0.0, likeness: float = 1.0) -> None:
         super().__init__(force)
-        self.risk = risk
+        self.risk, self.likeness = risk, likeness
 
 
-def judged(new: Any, before: Any, count: int = 100, seed: int = 0, **changes: Any) -> bool:
+def judged(new: Any, before: Any, count: int = 100, seed: int = 0, **changes: Any) -> bool | None:
     made = simulator(exploring_starts=0.5)
     fixed = Fixed(**{name: getattr(made, name) for name in made.__dataclass_fields__})
     outlook: Any = Outlook(
@@ -475,52 +497,60 @@ def judged(new: Any, before: Any, count: int = 100, seed: int = 0, **changes: An
         features=np.zeros((2, 1)),
         features_at=lambda states: states,
         restart=np.zeros(1),
-        rewards=np.zeros(2),
+        rewards=np.array([-1000.0, 0.0]),
         expect=lambda rows, inputs: inputs,
         reward=lambda inputs: inputs[:, :1],
         simulator=fixed,
     )
     rng = np.random.default_rng(seed)
-    found = judged_worse(new, before, replace(outlook, **changes), count, rng)
+    settings = settings_of(judging_rollouts=count)
+    found = refuses(new, before, replace(outlook, **changes), settings, rng)
     np.testing.assert_array_equal(rng.uniform(), np.random.default_rng(seed).uniform())
     return found
 
 
-def test_a_policy_that_earns_less_is_found_worse() -> None:
+def test_a_policy_that_earns_less_is_refused() -> None:
     # the common chance is two hundred times as large as the difference
-    assert judged(Risky(1.0), Risky(1.5))
-    assert not judged(Risky(1.5), Risky(1.0))
-    assert not judged(Risky(1.0), Risky(1.0))
+    assert judged(Risky(1.0), Risky(1.5)) is True
+    assert judged(Risky(1.5), Risky(1.0)) is False
+    assert judged(Risky(1.0), Risky(1.0)) is False
 
 
 def test_what_may_be_chance_is_not_held_against_it() -> None:
     refused = [judged(Risky(1.0, 8.0), Risky(1.02), seed=seed) for seed in range(200)]
     # the difference is 0.025 standard errors, so chance refuses about one in six
-    assert np.mean(refused) == pytest.approx(0.165, abs=0.08)
+    assert np.mean(np.array(refused, dtype=float)) == pytest.approx(0.165, abs=0.08)
 
 
-def test_without_a_policy_before_or_a_simulator_each_is_taken() -> None:
-    assert not judged(Risky(1.0), None)
-    assert not judged(Risky(1.0), Risky(1.5), simulator=None)
-    assert not judged(Risky(1.0), Risky(1.5), count=0)
+def test_a_policy_that_leaves_what_is_known_is_refused() -> None:
+    assert judged(Risky(2.0, likeness=0.5), Risky(1.0)) is True
+    # but where no two states are alike, the states of the policy before are the measure
+    assert judged(Risky(2.0, likeness=1e-3), Risky(1.0, likeness=1e-3)) is False
+    assert judged(Risky(2.0, likeness=0.0), Risky(1.0, likeness=0.0)) is False
+
+
+def test_without_a_policy_before_or_a_simulator_nothing_is_judged() -> None:
+    assert judged(Risky(1.0), None) is None
+    assert judged(Risky(1.0), Risky(1.5), simulator=None) is None
+    assert judged(Risky(1.0), Risky(1.5), count=0) is None
 
 
 # ---- in an update -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("approximation", ["exact", "pivoted"])
-def test_a_policy_that_is_found_worse_does_not_act(
+def test_a_policy_that_is_refused_does_not_act(
     approximation: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module: Any = reps if approximation == "exact" else low_rank_reps
     asked: list[tuple[Any, Any, int]] = []
-    said = iter((False, True, False))
+    said = iter((None, True, False))
 
-    def judge(new: Any, before: Any, outlook: Any, count: int, rng: Any) -> bool:
-        asked.append((new, before, count))
+    def judge(new: Any, before: Any, outlook: Any, settings: Any, rng: Any) -> bool | None:
+        asked.append((new, before, settings.judging_rollouts))
         return next(said)
 
-    monkeypatch.setattr(module, "judged_worse", judge)
+    monkeypatch.setattr(module, "refuses", judge)
     learner = kreps.KREPS(TASK, approximation=approximation, judging_rollouts=7)
     policies, infos = [], []
     for seed in range(3):
@@ -528,12 +558,29 @@ def test_a_policy_that_is_found_worse_does_not_act(
         assert isinstance(info, UpdateInfo)
         infos.append(info)
         policies.append(learner.state.policy)
-    assert [info.kept for info in infos] == [False, True, False]
-    assert ["policy kept" in info.shown()["note"] for info in infos] == [False, True, False]
+    assert [info.refused for info in infos] == [None, True, False]
+    assert ["refused" in info.shown()["note"] for info in infos] == [False, True, False]
     assert policies[1] is policies[0] and policies[2] is not policies[0]
     assert [before for _, before, _ in asked] == [None, policies[0], policies[0]]
     assert asked[1][0] is not policies[0] and asked[2][0] is policies[2]
     assert {count for _, _, count in asked} == {7}
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+def test_a_resumed_learner_judges_as_it_would_have(approximation: str, tmp_path: Path) -> None:
+    learner = kreps.KREPS(TASK, approximation=approximation, kl_bound=0.1)
+    for seed in range(2):
+        learner.update(turns(seed=seed))
+    learner.save(tmp_path / "before")
+    again = kreps.KREPS.resume(tmp_path / "before")
+    for one in (learner, again):
+        info = one.update(turns(seed=2))
+        assert isinstance(info, UpdateInfo) and info.refused is not None
+    states = turns()[0].observations
+    noise = np.ones((len(states), 1))
+    np.testing.assert_array_equal(
+        *(one.policy.process.act(states, noise) for one in (learner, again))
+    )
 
 
 def test_what_judges_is_what_the_update_expects(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -550,7 +597,8 @@ def test_what_judges_is_what_the_update_expects(monkeypatch: pytest.MonkeyPatch)
 def test_a_learnt_model_tells_the_better_of_two_policies(monkeypatch: pytest.MonkeyPatch) -> None:
     faster = [replace(r, rewards=r.observations[1:, 1]) for r in turns()]
     outlook = outlook_of(faster, monkeypatch)
+    settings = settings_of(judging_rollouts=20)
     for seed in range(5):
         rng = np.random.default_rng(seed)
-        assert judged_worse(Push(-0.15), Push(0.15), outlook, 20, rng)
-        assert not judged_worse(Push(0.15), Push(-0.15), outlook, 20, rng)
+        assert refuses(Push(-0.15), Push(0.15), outlook, settings, rng) is True
+        assert refuses(Push(0.15), Push(-0.15), outlook, settings, rng) is False

@@ -38,7 +38,7 @@ BOUND_USED, BOUND_UNUSED = 0.8, 0.5
 LEAST_EFFECTIVE, LEAST_SHARE = 30.0, 0.05
 """Effective targets that a policy can be fitted to, and effective samples as a share of all."""
 
-KEPT_NOTE = 0.5
+REFUSED_NOTE = 0.5
 """Share of new policies that the model finds worse above which learning hardly goes on."""
 
 CLIPPED_NOTE = 0.9
@@ -476,19 +476,19 @@ def effective_samples(rows: Sequence[Row]) -> Finding:
 
 
 def judgement(rows: Sequence[Row]) -> Finding | None:
-    """Whether new policies pass the model's judgement; None if that was not recorded."""
+    """Whether new policies pass the model's judgement; None if nothing was judged."""
     name = "judgement"
-    share = recent(rows, "kept")
+    share = recent(rows, "refused")
     if not np.isfinite(share):
         return None
     said = f"Of the latest updates the model found {share:.0%} worse than the policy before"
-    if share <= KEPT_NOTE:
-        return Finding(name, "fine", share, KEPT_NOTE, f"{said}.")
+    if share <= REFUSED_NOTE:
+        return Finding(name, "fine", share, REFUSED_NOTE, f"{said}.")
     return Finding(
         name,
         "note",
         share,
-        KEPT_NOTE,
+        REFUSED_NOTE,
         f"{said}, which acts on: what V promises, roll-outs in the model do not keep.",
         "nothing, if the reward is good enough; else more data for each update "
         "(--set rollouts_per_iteration=20 --set window=60).",

@@ -155,7 +155,7 @@ class Learner(Generic[MethodSettings]):
 
     @property
     def policy(self) -> Policy:
-        """The policy learnt last.
+        """The policy that acts now: the one learnt last, if it was not refused.
 
         Raises:
             ConfigurationError: nothing has been learnt yet.

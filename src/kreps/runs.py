@@ -43,7 +43,6 @@ STAGES = (
 )
 NEWER = (
     "cpu_seconds_imagined_step",
-    "cpu_seconds_judgement",
     "weighted",
     "model_error",
     "clipped",
@@ -52,7 +51,8 @@ NEWER = (
     "max_rank",
     "ridge",
     "exploring",
-    "kept",
+    "refused",
+    "cpu_seconds_judgement",
 )
 """Columns that runs of earlier versions have not.  There they are NaN, as is the error where there
 is no model, and the cap where the features of V are of a fixed number."""
@@ -270,6 +270,6 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "max_rank": rank_cap(learner.settings),
         "ridge": info.ridge,
         "exploring": float(learner.exploring),
-        "kept": float(info.kept),
+        "refused": math.nan if info.refused is None else float(info.refused),
         **{f"cpu_seconds_{s.replace(' ', '_')}": round(seconds.get(s, 0.0), 5) for s in STAGES},
     }

@@ -106,12 +106,13 @@ class Settings(OnPolicySettings):
         imagined: actions per state that are drawn anew for a second bounded step, in which the
             model says what they lead to; 0 leaves that step out.
         imagined_noise: these actions are drawn with so many times the deviation of the policy, and
-            that of the policy fitted to them is divided by it; where roll-outs can be simulated.
+            that of the policy fitted to them is divided by it; where that is judged, see below.
         imagined_rollouts: share of these actions in states that the policy is led to in roll-outs
             simulated by the model ``"dynamics"``, the others in sampled states.  There are none in
             images, nor with fewer than ten samples for each coordinate of state and action.
         judging_rollouts: simulated likewise, of the new policy and of the one before, which acts on
-            if the new one earns less by more than the standard error; 0 takes every new one.
+            if the new one earns less by more than the standard error; 0 takes every new one, as it
+            is where nothing is imagined.
         model: transition model: ``"dynamics"`` regresses how the state changes, after a linear
             trend, and takes the features of V where that leads; ``"change"`` embeds how the
             features change, so that far from the data the state stays; ``"embedding"`` embeds the

@@ -86,7 +86,7 @@ class SparseGP:
             task,
             basis.kernel,
             basis.pivots,
-            solve_lower_transposed(basis.lower, signal / noise * mean),
+            np.ascontiguousarray(solve_lower_transposed(basis.lower, signal / noise * mean)),
             np.ascontiguousarray(solve_lower_transposed(basis.lower, explained).T),
             signal,
             noise,

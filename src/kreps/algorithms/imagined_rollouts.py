@@ -22,8 +22,8 @@ from kreps.kernels import Kernel
 from kreps.policies import StochasticPolicy
 
 AVERAGED = 2.0
-"""Steps that an average reward is taken over, in mean lengths of a roll-out: one in seven has not
-been restarted by then."""
+"""Steps that a policy is followed for, in mean lengths of a roll-out: one in seven has not been
+restarted by then."""
 
 
 def can_be_simulated(data: Transitions, task: TaskSpec) -> bool:
@@ -34,6 +34,37 @@ def can_be_simulated(data: Transitions, task: TaskSpec) -> bool:
     """
     coordinates = 1 + task.observation_size + task.action_size
     return task.image_shape is None and len(data) >= TREND_SAMPLES * coordinates
+
+
+@dataclass(frozen=True)
+class Followed:
+    """Simulated roll-outs of one policy.
+
+    Attributes:
+        rewards: (steps, count) expected, standardised.
+        likeness: (steps, count) of each state to the nearest sample: the kernel's value, up to 1.
+    """
+
+    rewards: FloatArray
+    likeness: FloatArray
+
+    def average_reward(
+        self, restart_probability: float, least: float, typical: float
+    ) -> FloatArray:
+        """Average reward per step (count,) of the restarting process, from each start.
+
+        A step counts by the chance that there has been no restart yet.  And what is not known is
+        the worst: the less a state is like any sample, the nearer its reward is taken to be to the
+        least one.
+
+        Args:
+            restart_probability: p.
+            least: of all rewards, standardised.
+            typical: likeness from which on a state is known.
+        """
+        share = (1.0 - restart_probability) ** np.arange(len(self.rewards))
+        known = np.minimum(self.likeness / typical, 1.0)
+        return share @ (least + known * (self.rewards - least)) / share.sum()
 
 
 @dataclass(frozen=True)
@@ -75,61 +106,58 @@ class Simulator:
         visited, nearest = [], []
         states = self._starts(len(left), rng)
         while len(states):
-            rows, _, successors, ended = self._step(policy, states, rng)
+            rows, _, _, successors, ended = self._step(policy, states, rng)
             visited.append(states)
             nearest.append(rows)
             left = np.where(ended, 0, left - 1)
             states, left = successors[left > 0], left[left > 0]
         return np.concatenate(visited), np.concatenate(nearest)
 
-    def average_rewards(
+    def follow(
         self,
         policy: StochasticPolicy,
         reward: Callable[[FloatArray], FloatArray],
-        least: float,
         count: int,
         rng: np.random.Generator,
-    ) -> FloatArray:
-        """Average reward per step (count,) of a policy, from each of so many starts.
+    ) -> Followed:
+        """A policy from so many starts, without random restarts.
 
-        No random restarts are drawn: a step counts by the chance that there has been none yet.
-        And what is not known is the worst: the less a state is like any sample, the nearer its
-        reward is taken to be to the least one.
+        What is drawn does not depend on the policy: from copies of one generator two of them meet
+        the same chance.
 
         Args:
             policy: to be followed, with its noise.
             reward: of states and scaled, applied actions (m, ds + da).
-            least: of all rewards.
             count: of the starts.
             rng: of starts, noise and ends.
         """
-        steps = ceil(AVERAGED / self.restart_probability)
-        share = (1.0 - self.restart_probability) ** np.arange(steps)
-        asked, known = [], []
+        steps = min(ceil(AVERAGED / self.restart_probability), self.longest)
+        asked, likeness = [], []
         states = self._starts(count, rng)
         for _ in range(steps):
-            rows, inputs, successors, ended = self._step(policy, states, rng)
+            _, alike, inputs, successors, ended = self._step(policy, states, rng)
             asked.append(inputs)
-            known.append(self._likeness(states, rows))
+            likeness.append(alike)
             states = np.where(ended[:, None], self._starts(count, rng), successors)
-        expected = reward(np.concatenate(asked)).reshape(steps, count)
-        rewards = least + np.array(known) * (expected - least)
-        return share @ rewards / share.sum()
+        rewards = reward(np.concatenate(asked)).reshape(steps, count)
+        return Followed(rewards, np.array(likeness))
 
     def _step(
         self, policy: StochasticPolicy, states: FloatArray, rng: np.random.Generator
-    ) -> tuple[IntArray, FloatArray, FloatArray, BoolArray]:
+    ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray]:
         """One step from states (m, ds), real ends and random restarts left to the caller.
 
-        The nearest samples (m,), the states and applied actions (m, ds + da), successors (m, ds)
-        within the range of the data, and whether the task ended (m,).
+        The nearest samples (m,) and their likeness (m,), the states and applied actions
+        (m, ds + da), successors (m, ds) within the range of the data, and whether the task ended
+        (m,).
         """
-        rows = self._nearest(states)
+        rows, likeness = self._nearest(states)
         noise = rng.standard_normal((len(states), self.task.action_size))
         actions = self.task.scaled(self.task.clip(policy.act(states, noise)))
         inputs = np.concatenate([states, actions], axis=1)
         successors, ends = self.dynamics.draw(rows, inputs, rng)
-        return rows, inputs, np.clip(successors, *self._range), rng.uniform(size=len(ends)) < ends
+        ended = rng.uniform(size=len(ends)) < ends
+        return rows, likeness, inputs, np.clip(successors, *self._range), ended
 
     @cached_property
     def _samples(self) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -139,17 +167,16 @@ class Simulator:
         centred = coordinates - mean
         return mean, centred, 0.5 * np.sum(centred * centred, axis=1)
 
-    def _nearest(self, states: FloatArray) -> IntArray:
-        """Sample numbers (m,): ``argmin |e_i - f_j|^2`` is ``argmax e_i'f_j - |f_j|^2 / 2``."""
-        mean, centred, half_squares = self._samples
-        inner = (self.kernel.embed(states) - mean) @ centred.T
-        return np.argmax(inner - half_squares, axis=1)
+    def _nearest(self, states: FloatArray) -> tuple[IntArray, FloatArray]:
+        """The nearest samples (m,) to states (m, ds), and the kernel's values (m,) with them.
 
-    def _likeness(self, states: FloatArray, rows: IntArray) -> FloatArray:
-        """Kernel values (m,) of states (m, ds) with the samples (m,)."""
-        mean, centred, _ = self._samples
-        apart = self.kernel.embed(states) - mean - centred[rows]
-        return np.exp(-0.5 * np.sum(apart * apart, axis=1))
+        ``argmin |e_i - f_j|^2`` is ``argmax e_i'f_j - |f_j|^2 / 2``.
+        """
+        mean, centred, half_squares = self._samples
+        embedded = self.kernel.embed(states) - mean
+        rows = np.argmax(embedded @ centred.T - half_squares, axis=1)
+        apart = embedded - centred[rows]
+        return rows, np.exp(-0.5 * np.sum(apart * apart, axis=1))
 
     def _starts(self, count: int, rng: np.random.Generator) -> FloatArray:
         starts = self.data.points[rng.choice(self.data.start, count)]

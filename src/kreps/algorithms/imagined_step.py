@@ -59,9 +59,10 @@ class Outlook:
         """With how many deviations of a policy its actions are imagined: ``imagined_noise``.
 
         One that then acts with as much less is soon sure of itself, so it has to be judged: where
-        nothing is simulated, 1.
+        it is not, 1.
         """
-        return settings.imagined_noise if self.simulator is not None else 1.0
+        judged = self.simulator is not None and settings.judging_rollouts > 0
+        return settings.imagined_noise if judged else 1.0
 
     def rewards_of(self, inputs: FloatArray) -> FloatArray:
         """Expected rewards (m,), standardised, of states and scaled, applied actions (m, ds + da).

@@ -7,7 +7,8 @@ starts and with the same noise, and if it earns less the one before acts once mo
 
 Of states that no sample is like, the model would say that rewards are as they are on average, which
 late in learning is good.  A policy that goes there on purpose was never seen to: the judge takes
-what is not known for the worst that was.
+what is not known for the worst that was.  How like the samples a state has to be is told by those
+of the policy before, most of which are known: in many coordinates no two states are much alike.
 """
 
 from __future__ import annotations
@@ -19,31 +20,40 @@ import numpy as np
 
 from kreps.algorithms.imagined_step import Outlook
 from kreps.policies import StochasticPolicy
+from kreps.settings import Settings
 
 
-def judged_worse(
+def refuses(
     new: StochasticPolicy,
     before: StochasticPolicy | None,
     outlook: Outlook,
-    count: int,
+    settings: Settings,
     rng: np.random.Generator,
-) -> bool:
+) -> bool | None:
     """Whether a new policy earns less than the one before, by more than the standard error.
+
+    That error is of starts and noise; of its own errors the model knows nothing.
 
     Args:
         new, before: with their noise; None before the first update.
-        outlook: what the model says; without a simulator it says nothing of policies.
-        count: simulated roll-outs of each, 2 at least; 0 asks nothing.
+        outlook: what the model says.
+        settings: ``judging_rollouts`` of each policy, and how often the process restarts.
         rng: of the roll-outs; it is copied, so that both policies meet the same chance.
+
+    Returns:
+        None where nothing can be judged, or is to be.
     """
+    count = settings.judging_rollouts
     if before is None or outlook.simulator is None or not count:
-        return False
+        return None
     process = replace(outlook.simulator, exploring_starts=0.0)
-    earned, before_earned = (
-        process.average_rewards(
-            policy, outlook.rewards_of, outlook.rewards.min(), count, deepcopy(rng)
-        )
-        for policy in (new, before)
+    followed, followed_before = (
+        process.follow(policy, outlook.rewards_of, count, deepcopy(rng)) for policy in (new, before)
     )
-    gain = earned - before_earned
+    typical = max(float(np.median(followed_before.likeness)), np.finfo(np.float64).tiny)
+    earned, earned_before = (
+        each.average_reward(settings.restart_probability, outlook.rewards.min(), typical)
+        for each in (followed, followed_before)
+    )
+    gain = earned - earned_before
     return bool(gain.mean() < -gain.std(ddof=1) / np.sqrt(count))

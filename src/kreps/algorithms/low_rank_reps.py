@@ -31,7 +31,7 @@ from kreps.algorithms.chunk_sums import (
 )
 from kreps.algorithms.dynamics import Dynamics, Motion, after_ends, observed_expectation
 from kreps.algorithms.imagined_step import Outlook, imagine
-from kreps.algorithms.judgement import judged_worse
+from kreps.algorithms.judgement import refuses
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
     Expectation,
@@ -188,7 +188,7 @@ def update(
     clock.lap("policy")
 
     # the same once more, for other actions in the states of the sample and where they lead
-    reward_start, kept = state.reward_start, False
+    reward_start, refused = state.reward_start, None
     if settings.imagined and expectation.of_actions is not None and seen is not None:
         inputs = state_actions(sample, task)
         targets = (rewards[sampled] - rewards[sampled].mean())[:, None]
@@ -222,14 +222,14 @@ def update(
         policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
         policy = fit_sparse(task, centres, policy_sums, x, noise, 1.0 / outlook.widening(settings))
         clock.lap("imagined step")
-        kept = judged_worse(policy, state.policy, outlook, settings.judging_rollouts, rng)
+        refused = refuses(policy, state.policy, outlook, settings, rng)
         clock.lap("judgement")
     bases.append(centres)
 
     new_state = state.after_data(
         *(seen or (count, n)),
         window=window,
-        policy=state.policy if kept else policy,
+        policy=state.policy if refused else policy,
         value=basis.function(reward_unit * dual.theta),
         embedding_start=embedding_start,
         reward_start=reward_start,
@@ -252,7 +252,7 @@ def update(
         embedding_parameters=None if embedding_start is None else np.exp(embedding_start),
         policy_parameters=np.exp(x),
         noise=policy.noise,
-        kept=kept,
+        refused=refused,
         jitter=max(
             dual.jitter,
             *jitters,
@@ -404,13 +404,13 @@ def fit_sparse(
     sums: PolicySums,
     x: FloatArray,
     noise: float,
-    widening: float = 1.0,
+    deviation: float = 1.0,
 ) -> SparseGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,), its deviation times ``widening``.
+    """The policy at log hyper-parameters ``x`` (g + 2,), its own deviation times ``deviation``.
 
     Until then its actions are drawn with ``noise``.
     """
-    scale = widening**2  # of signal and noise alike, so that the mean stays
+    scale = deviation**2  # of signal and noise alike, so that the mean stays
     signal = scale * float(np.exp(x[-2]))
     return SparseGP.fit(task, centres, sums, signal=signal, noise=scale * noise)
 

@@ -12,7 +12,7 @@ import numpy as np
 from kreps.algorithms.dynamics import Dynamics, fit_dynamics, observed_expectation
 from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
-from kreps.algorithms.judgement import judged_worse
+from kreps.algorithms.judgement import refuses
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
     feature_differences,
@@ -80,7 +80,8 @@ class UpdateInfo:
             After a widened second step the policy has its sf2 and noise divided.
         noise: variance that actions are drawn with, in units of the action scale squared, by the
             fitted policy.
-        kept: whether the policy before acts on, as the model found the fitted one worse.
+        refused: whether the model found the fitted policy worse than the one before, which then
+            acts on; None where nothing was judged.
         jitter: largest jitter that a factorisation of this update needed; trial points of the
             hyper-parameter searches do not count.
         seconds: CPU seconds of this process by stage.
@@ -101,7 +102,7 @@ class UpdateInfo:
     embedding_parameters: FloatArray | None
     policy_parameters: FloatArray
     noise: float
-    kept: bool
+    refused: bool | None
     jitter: float
     seconds: dict[str, float]
 
@@ -122,7 +123,7 @@ class UpdateInfo:
             "ESS": f"{self.effective_samples:.0f}",
             "gap": f"{self.dual.gap:.0e}",
             "note": f"{_NOTES.get(self.dual.outcome, '')}"
-            + ("  found worse: policy kept" if self.kept else "")
+            + ("  refused: the policy before acts" if self.refused else "")
             + (f"  jitter {self.jitter:.0e}" if self.jitter else ""),
         }
 
@@ -180,7 +181,7 @@ def update(
     clock.lap("policy")
 
     # the same once more, for other actions in these states and where they lead
-    reward_start, kept = state.reward_start, False
+    reward_start, refused = state.reward_start, None
     if settings.imagined and expectation.of_actions is not None:
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
         targets = (rewards - rewards.mean())[:, None]
@@ -203,13 +204,13 @@ def update(
         policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
         policy = fit_policy(support, kernel, task, policy_x, 1.0 / outlook.widening(settings))
         clock.lap("imagined step")
-        kept = judged_worse(policy, state.policy, outlook, settings.judging_rollouts, rng)
+        refused = refuses(policy, state.policy, outlook, settings, rng)
         clock.lap("judgement")
 
     new_state = state.after(
         rollouts,
         window,
-        policy=state.policy if kept else policy,
+        policy=state.policy if refused else policy,
         value=basis.function(reward_unit * dual.theta),
         embedding_start=expectation.parameters,
         reward_start=reward_start,
@@ -235,7 +236,7 @@ def update(
         ),
         policy_parameters=np.exp(policy_x),
         noise=policy.noise,
-        kept=kept,
+        refused=refused,
         jitter=max(dual.jitter, policy.factor.jitter, *jitters),
         seconds=clock.seconds,
     )
@@ -524,11 +525,11 @@ def fit_policy(
     state_kernel: Kernel,
     task: TaskSpec,
     x: FloatArray,
-    widening: float = 1.0,
+    deviation: float = 1.0,
 ) -> CostSensitiveGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,), its deviation times ``widening``."""
+    """The policy at log hyper-parameters ``x`` (g + 2,), its own deviation times ``deviation``."""
     weights, noise = drawn_noise(samples, float(np.exp(x[-1])))
-    scale = widening**2  # of signal and noise alike, so that the mean stays
+    scale = deviation**2  # of signal and noise alike, so that the mean stays
     return CostSensitiveGP(
         task,
         state_kernel.with_lengthscales(np.exp(x[:-2])),
