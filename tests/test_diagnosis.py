@@ -376,6 +376,21 @@ def test_only_what_may_be_unknown_may_be_nan(
             folder.rows()
 
 
+def test_new_columns_come_after_those_of_all_versions_before() -> None:
+    # of the last version before policies were judged
+    before = [
+        "weighted",
+        "model_error",
+        "clipped",
+        "eta_floor",
+        "policy_noise",
+        "max_rank",
+        "ridge",
+        "exploring",
+    ]
+    assert NEWER[: 1 + len(before)] == ("cpu_seconds_imagined_step", *before)
+
+
 def test_files_with_some_of_the_newer_columns_are_refused(tmp_path: Path) -> None:
     with pytest.raises(StorageError, match="columns"):
         RunFolder(write_run(tmp_path, rows(), without=NEWER[:2])).rows()
