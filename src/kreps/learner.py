@@ -391,6 +391,9 @@ class KREPS(OnPolicyLearner[Settings]):
     def update(self, rollouts: Iterable[Rollout] | Dataset) -> UpdateReport:
         """One update from roll-outs collected anywhere; those kept from before count too.
 
+        A policy that the model finds worse than the one before is refused, and that one stays; the
+        report says so (``refused``).
+
         Args:
             rollouts: at least one; their actions as commanded, before any clipping.  Or a
                 `kreps.Dataset` of any size, which is learnt from alone and not kept: later updates

@@ -23,7 +23,7 @@ class LearnerState:
         iteration: updates made.
         rollouts, steps: roll-outs and environment steps seen, forgotten ones included.
         policy: that acts next: of the latest update, or the one before if that was refused.
-        value: V of the latest update, if the method has one in an RKHS.
+        value: V of the latest update, refused or not, if the method has one in an RKHS.
         embedding_start, reward_start, policy_start: log hyper-parameters to start the next fits
             from, if the method fits any.
     """
