@@ -57,6 +57,12 @@ NEWER = (
 """Columns that runs of earlier versions have not.  There they are NaN, as is the error where there
 is no model, and the cap where the features of V are of a fixed number."""
 
+
+def seconds_column(stage: str) -> str:
+    """Of the CPU seconds of a stage."""
+    return f"cpu_seconds_{stage.replace(' ', '_')}"
+
+
 COLUMNS = (
     "iteration",
     "rollouts",
@@ -78,7 +84,7 @@ COLUMNS = (
     "newton_iterations",
     "outcome",
     "jitter",
-    *(f"cpu_seconds_{stage.replace(' ', '_')}" for stage in STAGES[:-2]),
+    *(column for column in map(seconds_column, STAGES) if column not in NEWER),
     *NEWER,
 )
 
@@ -271,5 +277,5 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "ridge": info.ridge,
         "exploring": float(learner.exploring),
         "refused": math.nan if info.refused is None else float(info.refused),
-        **{f"cpu_seconds_{s.replace(' ', '_')}": round(seconds.get(s, 0.0), 5) for s in STAGES},
+        **{seconds_column(stage): round(seconds.get(stage, 0.0), 5) for stage in STAGES},
     }

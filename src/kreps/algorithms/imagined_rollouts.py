@@ -180,7 +180,7 @@ class Simulator:
 
     def _starts(self, count: int, rng: np.random.Generator) -> FloatArray:
         starts = self.data.points[rng.choice(self.data.start, count)]
-        anywhere = self.data.states[rng.choice(len(self.data), count)]
+        anywhere = self.data.points[rng.choice(self.data.state, count)]
         return np.where(rng.uniform(size=(count, 1)) < self.exploring_starts, anywhere, starts)
 
     @cached_property

@@ -37,7 +37,7 @@ def refuses(
     Args:
         new, before: with their noise; None before the first update.
         outlook: what the model says.
-        settings: ``judging_rollouts`` of each policy, and how often the process restarts.
+        settings: ``judging_rollouts`` of each policy.
         rng: of the roll-outs; it is copied, so that both policies meet the same chance.
 
     Returns:
@@ -52,7 +52,7 @@ def refuses(
     )
     typical = max(float(np.median(followed_before.likeness)), np.finfo(np.float64).tiny)
     earned, earned_before = (
-        each.average_reward(settings.restart_probability, outlook.rewards.min(), typical)
+        each.average_reward(process.restart_probability, outlook.rewards.min(), typical)
         for each in (followed, followed_before)
     )
     gain = earned - earned_before
