@@ -16,6 +16,7 @@ import pytest
 import kreps
 from kreps import policies
 from kreps.algorithms import low_rank_reps, reps
+from kreps.algorithms.boldness import ETA_FLOOR_JUDGED, ETA_FLOOR_NOT_JUDGED
 from kreps.algorithms.dynamics import TREND_SAMPLES, Dynamics, Motion, fit_dynamics
 from kreps.algorithms.imagined_rollouts import AVERAGED, Followed, Simulator, can_be_simulated
 from kreps.algorithms.imagined_step import Outlook, imagine
@@ -202,6 +203,24 @@ def updated(**settings: Any) -> tuple[kreps.KREPS, UpdateInfo]:
     info = learner.update(turns())
     assert isinstance(info, UpdateInfo)
     return learner, info
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+@pytest.mark.parametrize(
+    ("settings", "floor"),
+    [
+        ({}, ETA_FLOOR_JUDGED),
+        ({"judging_rollouts": 0}, ETA_FLOOR_NOT_JUDGED),
+        ({"imagined": 0}, ETA_FLOOR_NOT_JUDGED),  # what is not imagined is not judged
+        ({"model": "change"}, ETA_FLOOR_NOT_JUDGED),  # nor is what is not simulated
+        ({"eta_floor": 0.2}, 0.2),
+    ],
+)
+def test_the_temperature_falls_lower_where_the_policy_is_judged(
+    approximation: str, settings: dict[str, Any], floor: float
+) -> None:
+    _, info = updated(approximation=approximation, **settings)
+    assert info.eta_floor == floor
 
 
 @pytest.mark.parametrize("approximation", ["exact", "pivoted"])

@@ -23,7 +23,7 @@ def test_the_observed_recipe_is_one_step_with_the_numbers_of_old() -> None:
 
 def test_the_default_recipe_asks_the_model_for_more_than_the_observed_one() -> None:
     default = settings_of()
-    assert default.ridge is None
+    assert default.ridge is None and default.eta_floor is None
     assert default.imagined > 0
     assert 0.0 < default.exploring_starts < 1.0
     own = {
@@ -124,6 +124,7 @@ def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
 @pytest.mark.parametrize(
     ("name", "value"),
     [
+        ("eta_floor", None),
         ("eta_floor", 0),
         ("eta_floor", 0.0),
         ("kl_bound", 2),

@@ -96,7 +96,8 @@ class Settings(OnPolicySettings):
         kl_bound: epsilon of Eq. 2 in nats: how far one update may move from the samples.
         eta_floor: least temperature, in standard deviations of the reward.  Near convergence the
             optimum of the dual falls to zero and the KL bound would chase noise; a floor lets the
-            bound go slack instead.  0 leaves only a numerical safeguard of 1e-6.
+            bound go slack instead.  0 leaves only a numerical safeguard of 1e-6; None takes 0.01
+            where policies are judged, see below, and 0.05 where they are not.
         ridge: rho times the number of samples; the softness of the stationarity constraint.  None
             takes the mean squared leave-one-out error of the transition model: stationarity is
             asked for as strictly as successors can be predicted (but not below 0.001).
@@ -132,7 +133,7 @@ class Settings(OnPolicySettings):
     """
 
     kl_bound: float = 1.0
-    eta_floor: float = 0.05
+    eta_floor: float | None = None
     ridge: float | None = None
     exploring_starts: float = 0.25
     imagined: int = 4
@@ -157,7 +158,8 @@ class Settings(OnPolicySettings):
         self._positive("kl_bound", "basis_tolerance")
         if self.ridge is not None:
             self._check("ridge", Real, "positive and finite, or None", lambda v: 0 < v < inf)
-        self._check("eta_floor", Real, "finite and >= 0", lambda v: 0 <= v < inf)
+        if self.eta_floor is not None:
+            self._check("eta_floor", Real, "finite and >= 0, or None", lambda v: 0 <= v < inf)
         self._check("exploring_starts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
         self._check("imagined_noise", Real, "finite and >= 1", lambda v: 1 <= v < inf)
         self._check("imagined_rollouts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)

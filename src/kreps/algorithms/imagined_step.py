@@ -18,11 +18,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kreps.algorithms.boldness import least_temperature, widening
 from kreps.algorithms.imagined_rollouts import Simulator
 from kreps.algorithms.transition_model import feature_differences
 from kreps.arrays import FloatArray, IntArray
 from kreps.data import TaskSpec
-from kreps.dual import ETA_LEAST, DualProblem
+from kreps.dual import DualProblem
 from kreps.policies import StochasticPolicy
 from kreps.settings import Settings
 
@@ -54,15 +55,6 @@ class Outlook:
     expect: Callable[[IntArray, FloatArray], FloatArray]
     reward: Callable[[FloatArray], FloatArray]
     simulator: Simulator | None
-
-    def widening(self, settings: Settings) -> float:
-        """With how many deviations of a policy its actions are imagined: ``imagined_noise``.
-
-        One that then acts with as much less is soon sure of itself, so it has to be judged: where
-        it is not, 1.
-        """
-        judged = self.simulator is not None and settings.judging_rollouts > 0
-        return settings.imagined_noise if judged else 1.0
 
     def rewards_of(self, inputs: FloatArray) -> FloatArray:
         """Expected rewards (m,), standardised, of states and scaled, applied actions (m, ds + da).
@@ -127,7 +119,7 @@ def imagine(
         rows = np.concatenate([rows, nearest])
         states = np.concatenate([states, led])
         features = np.concatenate([features, outlook.features_at(led)])
-    noise = outlook.widening(settings) * rng.standard_normal((count, task.action_size))
+    noise = widening(outlook.simulator, settings) * rng.standard_normal((count, task.action_size))
     actions = policy.act(states[of], noise)
     inputs = np.concatenate([states[of], task.scaled(task.clip(actions))], axis=1)
     rewards = outlook.rewards_of(inputs)
@@ -141,6 +133,6 @@ def imagine(
         ),
         kl_bound=settings.kl_bound,
         ridge=ridge / count,
-        eta_floor=max(settings.eta_floor, ETA_LEAST),
+        eta_floor=least_temperature(outlook.simulator, settings),
     )
     return ImaginedSamples(states, of, actions, problem)

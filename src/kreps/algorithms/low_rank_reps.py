@@ -15,6 +15,7 @@ from operator import add
 
 import numpy as np
 
+from kreps.algorithms.boldness import least_temperature, widening
 from kreps.algorithms.chunk_sums import (
     BellmanRows,
     ChunkPolicySums,
@@ -56,7 +57,6 @@ from kreps.compute import Compute
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.dataset import Chunk, Dataset
 from kreps.dual import (
-    ETA_LEAST,
     DualProblem,
     DualSolution,
     effective_sample_size,
@@ -145,6 +145,8 @@ def update(
         clock,
     )
     errors, embedding_start = expectation.errors, expectation.parameters
+    # a data set is not learnt from by imagining
+    simulator = simulator_of(expectation, sample, kernel, task, settings, window) if seen else None
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
@@ -158,7 +160,7 @@ def update(
         rewards=rewards,
         kl_bound=settings.kl_bound,
         ridge=ridge / n,
-        eta_floor=max(settings.eta_floor, ETA_LEAST),
+        eta_floor=least_temperature(simulator, settings),
         compute=compute,
     )
     dual = solve(
@@ -209,7 +211,7 @@ def update(
             rewards=rewards[sampled],
             expect=expectation.of_actions,
             reward=regression.mean,
-            simulator=simulator_of(expectation, sample, kernel, task, settings, window),
+            simulator=simulator,
         )
         share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
@@ -220,7 +222,9 @@ def update(
         centres = policy_centres(support, kernel, x, settings, rng)
         weights, noise = drawn_noise(support, float(np.exp(x[-1])))
         policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
-        policy = fit_sparse(task, centres, policy_sums, x, noise, 1.0 / outlook.widening(settings))
+        policy = fit_sparse(
+            task, centres, policy_sums, x, noise, 1.0 / widening(simulator, settings)
+        )
         clock.lap("imagined step")
         refused = refuses(policy, state.policy, outlook, settings, rng)
         clock.lap("judgement")

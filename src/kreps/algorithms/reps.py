@@ -9,6 +9,7 @@ from math import inf
 
 import numpy as np
 
+from kreps.algorithms.boldness import least_temperature, widening
 from kreps.algorithms.dynamics import Dynamics, fit_dynamics, observed_expectation
 from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
@@ -25,7 +26,6 @@ from kreps.algorithms.transition_model import (
 from kreps.arrays import FloatArray, IntArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window
 from kreps.dual import (
-    ETA_LEAST,
     DualProblem,
     DualSolution,
     Outcome,
@@ -155,6 +155,7 @@ def update(
     errors = expectation.errors
     rewards, reward_unit = standardise(data.rewards)
     jitters = [expectation.jitter]
+    simulator = simulator_of(expectation, data, kernel, task, settings, window)
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
@@ -168,7 +169,7 @@ def update(
         ),
         kl_bound=settings.kl_bound,
         ridge=ridge / len(data),
-        eta_floor=max(settings.eta_floor, ETA_LEAST),
+        eta_floor=least_temperature(simulator, settings),
     )
     dual = solve_dual(problem)
     clock.lap("dual")
@@ -195,14 +196,14 @@ def update(
             rewards=rewards,
             expect=expectation.of_actions,
             reward=regression.predictor(targets),
-            simulator=simulator_of(expectation, data, kernel, task, settings, window),
+            simulator=simulator,
         )
         imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
         # V is nearly known, the temperature is to be found anew: it may have to rise
         dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
         support = PolicySamples.imagined(imagined, dual.weights, task).heaviest(MAX_SUPPORT)
         policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
-        policy = fit_policy(support, kernel, task, policy_x, 1.0 / outlook.widening(settings))
+        policy = fit_policy(support, kernel, task, policy_x, 1.0 / widening(simulator, settings))
         clock.lap("imagined step")
         refused = refuses(policy, state.policy, outlook, settings, rng)
         clock.lap("judgement")
@@ -282,7 +283,7 @@ def simulator_of(
     settings: Settings,
     window: Window,
 ) -> Simulator | None:
-    """What simulates the process, if the transition model can.
+    """What simulates the process for an imagined step, if there is one and the model can.
 
     Args:
         expectation: of the samples.
@@ -290,10 +291,11 @@ def simulator_of(
         kernel: over states.
         task, settings, window: of the update.
     """
-    if expectation.dynamics is None or not can_be_simulated(data, task):
+    dynamics = expectation.dynamics if settings.imagined else None
+    if dynamics is None or not can_be_simulated(data, task):
         return None
     return Simulator(
-        dynamics=expectation.dynamics,
+        dynamics=dynamics,
         data=data,
         kernel=kernel,
         task=task,

@@ -118,7 +118,7 @@ ABLATIONS: dict[str, Options] = {
     "no exploring starts": {"exploring_starts": 0.0},
     "one imagined action": {"imagined": 1},
     "ridge 0.1": {"ridge": 0.1},
-    "floor 0.1": {"eta_floor": 0.1},
+    "floor 0.05": {"eta_floor": 0.05},
     "half the KL bound": {"kl_bound": 0.5},
     "hard ranges": {"policy_fit": "bounded"},
     "changes of features embedded": {"model": "change"},
