@@ -24,18 +24,20 @@ SIMULATOR = cast(Simulator, object())  # only whether there is one counts
     ("simulator", "rollouts", "judged"),
     [(SIMULATOR, 50, True), (SIMULATOR, 0, False), (None, 50, False), (None, 0, False)],
 )
-def test_only_what_is_simulated_and_to_be_judged_is_bold(
+def test_policies_are_judged_by_a_simulator_if_they_are_to_be(
     simulator: Simulator | None, rollouts: int, judged: bool
 ) -> None:
-    settings = settings_of(judging_rollouts=rollouts)
-    assert is_judged(simulator, settings) == judged
-    floor = ETA_FLOOR_JUDGED if judged else ETA_FLOOR_NOT_JUDGED
-    assert least_temperature(simulator, settings) == floor
-    assert widening(simulator, settings) == (settings.imagined_noise if judged else 1.0)
-    assert ETA_FLOOR_JUDGED < ETA_FLOOR_NOT_JUDGED and settings.imagined_noise > 1.0
+    assert is_judged(simulator, settings_of(judging_rollouts=rollouts)) == judged
 
 
-@pytest.mark.parametrize("simulator", [SIMULATOR, None])
-def test_a_floor_that_was_asked_for_holds_everywhere(simulator: Simulator | None) -> None:
-    assert least_temperature(simulator, settings_of(eta_floor=0.3)) == 0.3
-    assert least_temperature(simulator, settings_of(eta_floor=0.0)) == ETA_LEAST
+def test_only_what_is_judged_is_bold() -> None:
+    assert least_temperature(True, settings_of()) == ETA_FLOOR_JUDGED
+    assert least_temperature(False, settings_of()) == ETA_FLOOR_NOT_JUDGED > ETA_FLOOR_JUDGED
+    assert widening(True, settings_of(imagined_noise=1.7)) == 1.7
+    assert widening(False, settings_of(imagined_noise=1.7)) == 1.0
+
+
+@pytest.mark.parametrize("judged", [True, False])
+def test_a_floor_that_was_asked_for_holds_everywhere(judged: bool) -> None:
+    assert least_temperature(judged, settings_of(eta_floor=0.3)) == 0.3
+    assert least_temperature(judged, settings_of(eta_floor=0.0)) == ETA_LEAST

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
@@ -9,8 +10,17 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.data import Rollout, TaskSpec
-from kreps.exploration import PINK, RED, WHITE, coloured_noise, tells_of_states
+from kreps.data import Rollout, TaskSpec, Window
+from kreps.exploration import (
+    PINK,
+    RED,
+    WHITE,
+    coloured_noise,
+    extended,
+    latest,
+    tells_alone,
+    tells_of_states,
+)
 
 TASK = TaskSpec(2, np.array([-2.0, -1.0]), np.array([2.0, 1.0]))
 
@@ -161,3 +171,68 @@ def test_first_roll_outs_are_as_the_seed_says() -> None:
         return np.concatenate([r.actions for r in learner.state.window.rollouts])
 
     np.testing.assert_array_equal(actions(), actions())
+
+
+# ---- what is remembered -----------------------------------------------------------------------
+
+PRICE = lambda s, a: -0.1 * a[:, 0] ** 2  # noqa: E731
+GOAL = lambda s, a: -0.1 * a[:, 0] ** 2 + 100.0 * (np.arange(len(s)) == 5)  # noqa: E731
+
+
+def of_rewards(rewards: list[Any], steps: int = 20) -> list[Rollout]:
+    return [rollout(reward, seed, steps=steps) for seed, reward in enumerate(rewards)]
+
+
+def test_one_roll_out_tells_if_it_is_long_enough() -> None:
+    assert tells_alone(rollout(GOAL, steps=7), TASK)  # two actions have six terms
+    assert not tells_alone(rollout(GOAL, steps=6), TASK)
+    assert not tells_alone(rollout(PRICE, steps=20), TASK)
+
+
+@pytest.mark.parametrize(
+    ("goals", "kept"),
+    [
+        ([], [4, 5, 6, 7, 8, 9]),  # the latest
+        ([0], [0, 5, 6, 7, 8, 9]),
+        ([0, 1, 3], [1, 3, 6, 7, 8, 9]),  # a third of the window, no more
+        ([0, 8], [0, 5, 6, 7, 8, 9]),
+        ([0, 5, 7], [4, 5, 6, 7, 8, 9]),
+        (list(range(10)), [4, 5, 6, 7, 8, 9]),
+    ],
+)
+@pytest.mark.parametrize("before", [0, 3, 6])
+def test_a_third_of_the_window_is_for_those_that_tell(
+    before: int, goals: list[int], kept: list[int]
+) -> None:
+    seen = of_rewards([GOAL if i in goals else PRICE for i in range(10)])
+    window = Window(6, tuple(seen[:before]))
+    found = extended(window, seen[before:], TASK)
+    assert found.capacity == 6
+    assert [next(i for i, r in enumerate(seen) if r is one) for one in found.rollouts] == kept
+
+
+@pytest.mark.parametrize("capacity", [None, 20, 10])
+def test_what_there_is_room_for_is_kept(capacity: int | None) -> None:
+    seen = of_rewards([PRICE, GOAL] * 5)
+    found = extended(Window(capacity, tuple(seen[:4])), seen[4:], TASK)
+    assert found == Window(capacity, tuple(seen))
+
+
+@pytest.mark.parametrize(("capacity", "count"), [(None, 10), (30, 10), (12, 8), (6, 4), (2, 2)])
+def test_the_latest_are_those_in_no_reserved_place(capacity: int | None, count: int) -> None:
+    seen = of_rewards([PRICE] * 10)
+    window = extended(Window(capacity), seen, TASK)
+    assert tuple(latest(window)) == tuple(seen[-count:])
+
+
+def test_it_explores_again_though_a_goal_is_remembered() -> None:
+    learner = kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **TINY | {"window": 6})
+    learner.learn(1, progress=False)
+    seen = learner.state.window.rollouts[0]
+    rewards = np.where(np.arange(len(seen)) == len(seen) - 1, 100.0, seen.rewards)
+    goal = Rollout(seen.observations, seen.actions, rewards, terminated=True)
+    learner.update([goal])
+    assert not learner.exploring
+    idle = [replace(r, rewards=-0.1 * np.clip(r.actions[:, 0], -1, 1) ** 2) for r in [seen] * 4]
+    learner.update(idle)
+    assert goal in learner.state.window.rollouts and learner.exploring

@@ -219,8 +219,12 @@ def updated(**settings: Any) -> tuple[kreps.KREPS, UpdateInfo]:
 def test_the_temperature_falls_lower_where_the_policy_is_judged(
     approximation: str, settings: dict[str, Any], floor: float
 ) -> None:
-    _, info = updated(approximation=approximation, **settings)
-    assert info.eta_floor == floor
+    learner, first = updated(approximation=approximation, **settings)
+    second = learner.update(turns(seed=1))
+    assert isinstance(second, UpdateInfo)
+    assert second.eta_floor == floor
+    assert (second.refused is not None) == (floor == ETA_FLOOR_JUDGED or "eta_floor" in settings)
+    assert first.eta_floor == floor and first.refused is None  # there is none beside it
 
 
 @pytest.mark.parametrize("approximation", ["exact", "pivoted"])
@@ -520,6 +524,7 @@ def judged(new: Any, before: Any, count: int = 100, seed: int = 0, **changes: An
         expect=lambda rows, inputs: inputs,
         reward=lambda inputs: inputs[:, :1],
         simulator=fixed,
+        judged=True,
     )
     rng = np.random.default_rng(seed)
     settings = settings_of(judging_rollouts=count)
@@ -551,7 +556,7 @@ def test_a_policy_that_leaves_what_is_known_is_refused() -> None:
 def test_without_a_policy_before_or_a_simulator_nothing_is_judged() -> None:
     assert judged(Risky(1.0), None) is None
     assert judged(Risky(1.0), Risky(1.5), simulator=None) is None
-    assert judged(Risky(1.0), Risky(1.5), count=0) is None
+    assert judged(Risky(1.0), Risky(1.5), judged=False) is None
 
 
 # ---- in an update -----------------------------------------------------------------------------
@@ -615,7 +620,7 @@ def test_what_judges_is_what_the_update_expects(monkeypatch: pytest.MonkeyPatch)
 
 def test_a_learnt_model_tells_the_better_of_two_policies(monkeypatch: pytest.MonkeyPatch) -> None:
     faster = [replace(r, rewards=r.observations[1:, 1]) for r in turns()]
-    outlook = outlook_of(faster, monkeypatch)
+    outlook = replace(outlook_of(faster, monkeypatch), judged=True)
     settings = settings_of(judging_rollouts=20)
     for seed in range(5):
         rng = np.random.default_rng(seed)

@@ -113,7 +113,7 @@ def assert_bounded(info: UpdateInfo, settings: Settings) -> None:
     assert (dual.weights >= 0.0).all()
     kl = kl_from_uniform(dual.weights)
     if dual.outcome is Outcome.AT_FLOOR:
-        assert dual.eta == pytest.approx(max(settings.eta_floor, 1e-6))
+        assert dual.eta == pytest.approx(info.eta_floor)
         assert kl <= settings.kl_bound * (1.0 + KL_TOLERANCE)
     else:
         assert kl == pytest.approx(settings.kl_bound, rel=1.01 * KL_TOLERANCE)

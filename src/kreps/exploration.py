@@ -1,4 +1,4 @@
-"""What a learner explores with before there is a policy, and for how long.
+"""What a learner explores with before there is a policy, for how long, and what it remembers of it.
 
 White noise averages out: what one step pushes the next one takes back, and a task whose states
 change slowly is never seen to change.  Noise with a power spectrum of ``1 / f^beta`` has slow parts
@@ -9,11 +9,12 @@ al. 2023 explore with it by default); red noise, beta = 2, is the random walk th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec
+from kreps.data import Rollout, TaskSpec, Window
 
 WHITE, PINK, RED = 0.0, 1.0, 2.0
 """Exponents beta of the spectrum."""
@@ -58,6 +59,40 @@ def tells_of_states(rollouts: Sequence[Rollout], task: TaskSpec) -> bool:
     price = np.linalg.lstsq(terms, rewards)[0]
     exact = np.abs(rewards - terms @ price).max() <= least
     return not (exact and rewards.max() <= of_idle @ price + least)
+
+
+def extended(window: Window, rollouts: Sequence[Rollout], task: TaskSpec) -> Window:
+    """The window with new roll-outs: the latest, a third of it kept for those that tell of states.
+
+    Where a goal is seldom reached, the latest roll-outs may hold none, and say that to do nothing
+    is best.  Where each roll-out tells of the states, as it mostly does, these are the latest.
+    """
+    seen = (*window.rollouts, *rollouts)
+    kept = len(window.extend(rollouts).rollouts)
+    if kept == len(seen):
+        return replace(window, rollouts=seen)
+    telling = [i for i, rollout in enumerate(seen) if tells_alone(rollout, task)]
+    spared = telling[max(len(telling) - _reserved(window), 0) :]
+    others = [i for i in range(len(seen)) if i not in spared]
+    places = sorted(spared + others[len(spared) - kept :])
+    return replace(window, rollouts=tuple(seen[i] for i in places))
+
+
+def latest(window: Window) -> Sequence[Rollout]:
+    """Roll-outs that are in the window for being new."""
+    if window.capacity is None:
+        return window.rollouts
+    return window.rollouts[-(window.capacity - _reserved(window)) :]
+
+
+def _reserved(window: Window) -> int:
+    return 0 if window.capacity is None else window.capacity // 3
+
+
+def tells_alone(rollout: Rollout, task: TaskSpec) -> bool:
+    """Whether the rewards of one roll-out tell of states, and it is long enough to know."""
+    terms = quadratic_terms(np.zeros((1, task.action_size))).shape[1]
+    return len(rollout) > terms and tells_of_states([rollout], task)
 
 
 def quadratic_terms(actions: FloatArray) -> FloatArray:

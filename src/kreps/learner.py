@@ -23,7 +23,7 @@ from kreps.controller import Policy
 from kreps.data import Rollout, TaskSpec, Window
 from kreps.dataset import Dataset
 from kreps.errors import ConfigurationError, DataError
-from kreps.exploration import PINK, RED, WHITE, tells_of_states
+from kreps.exploration import PINK, RED, WHITE, latest, tells_of_states
 from kreps.policies import MAX_SUPPORT, BangBang, Gaussian, StochasticPolicy
 from kreps.rollout import Environment, collect, collect_grid, task_of, without_restarts
 from kreps.seeding import Purpose, generator
@@ -335,8 +335,8 @@ class OnPolicyLearner(Learner[OnPolicy]):
 
     @property
     def exploring(self) -> bool:
-        kept = self.state.window.rollouts
-        return bool(kept) and not tells_of_states(kept, self.task)
+        newest = latest(self.state.window)
+        return bool(newest) and not tells_of_states(newest, self.task)
 
     def _acting(self) -> tuple[StochasticPolicy, float]:
         """The policy of the next roll-outs, and the exponent of its noise's spectrum."""
@@ -421,7 +421,7 @@ class KREPS(OnPolicyLearner[Settings]):
     def _updated(
         self, rollouts: list[Rollout], rng: np.random.Generator
     ) -> tuple[LearnerState, UpdateReport]:
-        samples = sum(map(len, self.state.window.extend(rollouts).rollouts))
+        samples = sum(map(len, self.state.extended_window(rollouts, self.task).rollouts))
         if not low_rank_reps.applies(self.settings, samples):
             return super()._updated(rollouts, rng)
         return low_rank_reps.update(

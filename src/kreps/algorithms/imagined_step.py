@@ -45,6 +45,7 @@ class Outlook:
             or, if simulated, nearest to, and of states and scaled, applied actions (m, ds + da).
         reward: what reward (m, 1) is to be expected of such states and actions, from its mean.
         simulator: tells where a policy leads; None if the model does not.
+        judged: whether it is to follow new policies before they act.
     """
 
     states: FloatArray
@@ -55,6 +56,7 @@ class Outlook:
     expect: Callable[[IntArray, FloatArray], FloatArray]
     reward: Callable[[FloatArray], FloatArray]
     simulator: Simulator | None
+    judged: bool
 
     def rewards_of(self, inputs: FloatArray) -> FloatArray:
         """Expected rewards (m,), standardised, of states and scaled, applied actions (m, ds + da).
@@ -119,7 +121,7 @@ def imagine(
         rows = np.concatenate([rows, nearest])
         states = np.concatenate([states, led])
         features = np.concatenate([features, outlook.features_at(led)])
-    noise = widening(outlook.simulator, settings) * rng.standard_normal((count, task.action_size))
+    noise = widening(outlook.judged, settings) * rng.standard_normal((count, task.action_size))
     actions = policy.act(states[of], noise)
     inputs = np.concatenate([states[of], task.scaled(task.clip(actions))], axis=1)
     rewards = outlook.rewards_of(inputs)
@@ -133,6 +135,6 @@ def imagine(
         ),
         kl_bound=settings.kl_bound,
         ridge=ridge / count,
-        eta_floor=least_temperature(outlook.simulator, settings),
+        eta_floor=least_temperature(outlook.judged, settings),
     )
     return ImaginedSamples(states, of, actions, problem)

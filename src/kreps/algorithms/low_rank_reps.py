@@ -15,7 +15,7 @@ from operator import add
 
 import numpy as np
 
-from kreps.algorithms.boldness import least_temperature, widening
+from kreps.algorithms.boldness import is_judged, least_temperature, widening
 from kreps.algorithms.chunk_sums import (
     BellmanRows,
     ChunkPolicySums,
@@ -146,7 +146,10 @@ def update(
     )
     errors, embedding_start = expectation.errors, expectation.parameters
     # a data set is not learnt from by imagining
-    simulator = simulator_of(expectation, sample, kernel, task, settings, window) if seen else None
+    simulator = None
+    if seen is not None:
+        simulator = simulator_of(expectation, sample, kernel, task, settings, window)
+    judged = is_judged(simulator, settings)
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
@@ -160,7 +163,7 @@ def update(
         rewards=rewards,
         kl_bound=settings.kl_bound,
         ridge=ridge / n,
-        eta_floor=least_temperature(simulator, settings),
+        eta_floor=least_temperature(judged, settings),
         compute=compute,
     )
     dual = solve(
@@ -212,6 +215,7 @@ def update(
             expect=expectation.of_actions,
             reward=regression.mean,
             simulator=simulator,
+            judged=judged,
         )
         share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
@@ -222,9 +226,7 @@ def update(
         centres = policy_centres(support, kernel, x, settings, rng)
         weights, noise = drawn_noise(support, float(np.exp(x[-1])))
         policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
-        policy = fit_sparse(
-            task, centres, policy_sums, x, noise, 1.0 / widening(simulator, settings)
-        )
+        policy = fit_sparse(task, centres, policy_sums, x, noise, 1.0 / widening(judged, settings))
         clock.lap("imagined step")
         refused = refuses(policy, state.policy, outlook, settings, rng)
         clock.lap("judgement")

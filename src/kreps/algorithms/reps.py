@@ -9,7 +9,7 @@ from math import inf
 
 import numpy as np
 
-from kreps.algorithms.boldness import least_temperature, widening
+from kreps.algorithms.boldness import is_judged, least_temperature, widening
 from kreps.algorithms.dynamics import Dynamics, fit_dynamics, observed_expectation
 from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
@@ -64,7 +64,7 @@ class UpdateInfo:
     Attributes:
         samples: n.
         kl_bound: epsilon.
-        eta_floor: least temperature, in standard deviations of the reward.
+        eta_floor: least temperature as taken, in standard deviations of the reward.
         ridge: rho times the number of samples.
         model_error: of the transition model by leave-one-out, relative (`LeaveOneOut.relative`);
             nan without a model.
@@ -156,6 +156,7 @@ def update(
     rewards, reward_unit = standardise(data.rewards)
     jitters = [expectation.jitter]
     simulator = simulator_of(expectation, data, kernel, task, settings, window)
+    judged = is_judged(simulator, settings)
     clock.lap("embedding")
 
     # Eqs. 2 and 5: minimise the dual
@@ -169,7 +170,7 @@ def update(
         ),
         kl_bound=settings.kl_bound,
         ridge=ridge / len(data),
-        eta_floor=least_temperature(simulator, settings),
+        eta_floor=least_temperature(judged, settings),
     )
     dual = solve_dual(problem)
     clock.lap("dual")
@@ -197,13 +198,14 @@ def update(
             expect=expectation.of_actions,
             reward=regression.predictor(targets),
             simulator=simulator,
+            judged=judged,
         )
         imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
         # V is nearly known, the temperature is to be found anew: it may have to rise
         dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
         support = PolicySamples.imagined(imagined, dual.weights, task).heaviest(MAX_SUPPORT)
         policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
-        policy = fit_policy(support, kernel, task, policy_x, 1.0 / widening(simulator, settings))
+        policy = fit_policy(support, kernel, task, policy_x, 1.0 / widening(judged, settings))
         clock.lap("imagined step")
         refused = refuses(policy, state.policy, outlook, settings, rng)
         clock.lap("judgement")

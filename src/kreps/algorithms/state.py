@@ -10,6 +10,7 @@ from typing import Any, Protocol
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window
 from kreps.errors import ConfigurationError, DataError
+from kreps.exploration import extended
 from kreps.policies import MAX_SUPPORT, LearntPolicy
 from kreps.value import LinearFunction
 
@@ -63,7 +64,7 @@ class LearnerState:
         """
         for rollout in rollouts:
             rollout.check(task)
-        window = self.window.extend(rollouts)
+        window = extended(self.window, rollouts, task)
         if not window.rollouts:
             raise DataError("there is no roll-out to learn from; give at least one")
         return window
