@@ -23,7 +23,8 @@ class LearnerSettings:
 
     Attributes:
         restart_probability: p, with which the process restarts at each step.
-        window: how many of the latest roll-outs are kept; None keeps all.
+        window: how many of the latest roll-outs are kept, a third of them for those whose rewards
+            tell of the states; None keeps all.
     """
 
     restart_probability: float = 0.02
