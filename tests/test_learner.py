@@ -483,8 +483,8 @@ def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem(
 ) -> None:
     # Measured over seeds 0 to 7: with the recipe "observed" the cost is 1.02 to 1.10 of the optimum
     # for seven, 1.32 for one.  With the default it is 1.01 to 1.36 for all after six updates and
-    # 1.01 to 1.20 after ten; with eta_floor=0.05, where the temperature does not fall as low, 1.01 to
-    # 1.09 after either.  The first policy costs 54 times the optimum, doing nothing 4.6 times.
+    # 1.01 to 1.20 after ten; with eta_floor=0.05, where the temperature does not fall as low, it is
+    # 1.01 to 1.09 after either.  The first policy costs 54 times the optimum, doing nothing 4.6.
     _, best = optimum()
     shares = []
     for seed in range(5):
