@@ -524,7 +524,6 @@ def judged(new: Any, before: Any, count: int = 100, seed: int = 0, **changes: An
         expect=lambda rows, inputs: inputs,
         reward=lambda inputs: inputs[:, :1],
         simulator=fixed,
-        judged=True,
     )
     rng = np.random.default_rng(seed)
     settings = settings_of(judging_rollouts=count)
@@ -556,7 +555,7 @@ def test_a_policy_that_leaves_what_is_known_is_refused() -> None:
 def test_without_a_policy_before_or_a_simulator_nothing_is_judged() -> None:
     assert judged(Risky(1.0), None) is None
     assert judged(Risky(1.0), Risky(1.5), simulator=None) is None
-    assert judged(Risky(1.0), Risky(1.5), judged=False) is None
+    assert judged(Risky(1.0), Risky(1.5), count=0) is None
 
 
 # ---- in an update -----------------------------------------------------------------------------
@@ -620,7 +619,7 @@ def test_what_judges_is_what_the_update_expects(monkeypatch: pytest.MonkeyPatch)
 
 def test_a_learnt_model_tells_the_better_of_two_policies(monkeypatch: pytest.MonkeyPatch) -> None:
     faster = [replace(r, rewards=r.observations[1:, 1]) for r in turns()]
-    outlook = replace(outlook_of(faster, monkeypatch), judged=True)
+    outlook = outlook_of(faster, monkeypatch)
     settings = settings_of(judging_rollouts=20)
     for seed in range(5):
         rng = np.random.default_rng(seed)

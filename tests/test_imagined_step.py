@@ -165,7 +165,6 @@ class Case:
             expect=self.expectation.of_actions,
             reward=self.reward if reward is None else reward,
             simulator=None,
-            judged=False,
         )
 
     def imagined(

@@ -73,7 +73,7 @@ def extended(window: Window, rollouts: Sequence[Rollout], task: TaskSpec) -> Win
         return replace(window, rollouts=seen)
     telling = [i for i, rollout in enumerate(seen) if tells_alone(rollout, task)]
     spared = telling[max(len(telling) - _reserved(window), 0) :]
-    others = [i for i in range(len(seen)) if i not in spared]
+    others = sorted(set(range(len(seen))) - set(spared))
     places = sorted(spared + others[len(spared) - kept :])
     return replace(window, rollouts=tuple(seen[i] for i in places))
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kreps.algorithms.boldness import least_temperature, widening
+from kreps.algorithms.boldness import is_judged, least_temperature, widening
 from kreps.algorithms.imagined_rollouts import Simulator
 from kreps.algorithms.transition_model import feature_differences
 from kreps.arrays import FloatArray, IntArray
@@ -45,7 +45,6 @@ class Outlook:
             or, if simulated, nearest to, and of states and scaled, applied actions (m, ds + da).
         reward: what reward (m, 1) is to be expected of such states and actions, from its mean.
         simulator: tells where a policy leads; None if the model does not.
-        judged: whether it is to follow new policies before they act.
     """
 
     states: FloatArray
@@ -56,7 +55,6 @@ class Outlook:
     expect: Callable[[IntArray, FloatArray], FloatArray]
     reward: Callable[[FloatArray], FloatArray]
     simulator: Simulator | None
-    judged: bool
 
     def rewards_of(self, inputs: FloatArray) -> FloatArray:
         """Expected rewards (m,), standardised, of states and scaled, applied actions (m, ds + da).
@@ -121,7 +119,8 @@ def imagine(
         rows = np.concatenate([rows, nearest])
         states = np.concatenate([states, led])
         features = np.concatenate([features, outlook.features_at(led)])
-    noise = widening(outlook.judged, settings) * rng.standard_normal((count, task.action_size))
+    judged = is_judged(outlook.simulator, settings)
+    noise = widening(judged, settings) * rng.standard_normal((count, task.action_size))
     actions = policy.act(states[of], noise)
     inputs = np.concatenate([states[of], task.scaled(task.clip(actions))], axis=1)
     rewards = outlook.rewards_of(inputs)
@@ -135,6 +134,6 @@ def imagine(
         ),
         kl_bound=settings.kl_bound,
         ridge=ridge / count,
-        eta_floor=least_temperature(outlook.judged, settings),
+        eta_floor=least_temperature(judged, settings),
     )
     return ImaginedSamples(states, of, actions, problem)

@@ -43,9 +43,9 @@ def refuses(
     Returns:
         None where nothing can be judged, or is to be.
     """
-    if not outlook.judged or outlook.simulator is None or before is None:
-        return None
     count = settings.judging_rollouts
+    if before is None or outlook.simulator is None or not count:
+        return None
     process = replace(outlook.simulator, exploring_starts=0.0)
     followed, followed_before = (
         process.follow(policy, outlook.rewards_of, count, deepcopy(rng)) for policy in (new, before)

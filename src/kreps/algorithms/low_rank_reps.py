@@ -215,7 +215,6 @@ def update(
             expect=expectation.of_actions,
             reward=regression.mean,
             simulator=simulator,
-            judged=judged,
         )
         share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)

@@ -198,7 +198,6 @@ def update(
             expect=expectation.of_actions,
             reward=regression.predictor(targets),
             simulator=simulator,
-            judged=judged,
         )
         imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
         # V is nearly known, the temperature is to be found anew: it may have to rise
