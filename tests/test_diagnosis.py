@@ -319,6 +319,25 @@ def test_causes_without_numbers_are_left_out() -> None:
     assert "transition model" not in {f.name for f in without_model}
 
 
+AT_FLOOR: dict[str, Any] = {"kl": 0.1, "outcome": "AT_FLOOR", "average_reward": LEVEL}
+
+
+def test_the_floor_is_the_one_that_holds() -> None:
+    lowered = [0.05] * 10 + [0.01] * 2
+    assert "at its floor (0.01)" in finding("step", **AT_FLOOR, eta_floor=lowered).sentence
+    found = finding("progress", average_reward=LEVEL, kl=1.0, eta_floor=lowered)
+    assert "eta_floor=0.02)" in found.remedy
+
+
+@pytest.mark.parametrize(("floor", "suggested"), [(0.05, True), (0.011, True), (0.01, False)])
+def test_a_floor_lower_than_was_found_to_pay_is_not_suggested(
+    floor: float, suggested: bool
+) -> None:
+    found = finding("step", **AT_FLOOR, eta_floor=floor)
+    assert found.severity == "note" and "window=60)" in found.remedy
+    assert ("lower eta_floor" in found.remedy) == suggested
+
+
 def test_policies_that_the_model_refuses_are_counted() -> None:
     refused = [1.0] * 7 + [0.0, 1.0, 0.0, 0.0, 1.0]
     assert finding("judgement", refused=refused).value == pytest.approx(0.4)

@@ -14,6 +14,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.special import stdtrit
 
+from kreps.algorithms.boldness import ETA_FLOOR_JUDGED
 from kreps.arrays import FloatArray
 from kreps.dual import ETA_LEAST, Outcome
 
@@ -193,9 +194,14 @@ def diagnose(
     return sorted((f for f in found if f is not None), key=lambda f: order.index(f.severity))
 
 
+def least_temperature(rows: Sequence[Row]) -> float:
+    """The floor of eta that holds, which need not be the one that held before; NaN if unknown."""
+    return float(rows[-1]["eta_floor"])
+
+
 def higher_floor(rows: Sequence[Row]) -> str:
     """The setting of twice the least temperature; of 0.2 where it is not known, or was none."""
-    floor = recent(rows, "eta_floor")
+    floor = least_temperature(rows)
     return f"--set eta_floor={2.0 * floor if floor > 2.0 * ETA_LEAST else 0.2:.2g}"
 
 
@@ -398,7 +404,7 @@ def step(rows: Sequence[Row]) -> Finding:
     late = rows[-RECENT:]
     share = float(np.mean(column(late, "kl") / column(late, "kl_bound")))
     bound = float(late[-1]["kl_bound"])
-    floor = recent(rows, "eta_floor")
+    floor = least_temperature(rows)
     at_floor = np.mean([row["outcome"] == Outcome.AT_FLOOR.name for row in late]) > 0.5
     if share >= BOUND_USED and still_rising(rows):
         return Finding(
@@ -422,6 +428,7 @@ def step(rows: Sequence[Row]) -> Finding:
                 f"The updates use {share:.0%} of the KL bound ({bound:g}): eta is at its floor"
                 f"{least}, so that decides the step.",
             )
+        lower = "" if floor <= ETA_FLOOR_JUDGED else ", and only then a lower eta_floor"
         return Finding(
             name,
             "note",
@@ -430,7 +437,7 @@ def step(rows: Sequence[Row]) -> Finding:
             f"The updates use {share:.0%} of the KL bound, as eta is at its floor{least}: the run "
             "has converged as far as its data and its model tell.",
             "if it is not good enough, more data for each update "
-            "(--set rollouts_per_iteration=20 --set window=60), and only then a lower eta_floor.",
+            f"(--set rollouts_per_iteration=20 --set window=60){lower}.",
         )
     said = f"The updates use {share:.0%} of the KL bound ({bound:g})."
     return Finding(name, "fine", share, BOUND_USED, said)

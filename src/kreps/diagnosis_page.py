@@ -174,7 +174,7 @@ def _draw_kl(axes: Axes, rows: Sequence[Row]) -> None:
 def _draw_eta(axes: Axes, rows: Sequence[Row]) -> None:
     _curve(axes, rows, column(rows, "eta"))
     axes.set_yscale("log")
-    floor = diagnosis.recent(rows, "eta_floor")
+    floor = diagnosis.least_temperature(rows)
     low, high = float(column(rows, "eta").min()), float(column(rows, "eta").max())
     if np.isfinite(floor):
         _line(axes, floor, f"floor {floor:.2g}", below=True)
