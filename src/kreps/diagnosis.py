@@ -119,6 +119,11 @@ def column(rows: Sequence[Row], name: str) -> FloatArray:
     return np.array([float(row[name]) for row in rows])
 
 
+def latest(rows: Sequence[Row], name: str) -> float:
+    """What holds now, such as a limit, which need not be what held before; NaN if unknown."""
+    return float(rows[-1][name])
+
+
 def recent(rows: Sequence[Row], name: str) -> float:
     """Mean of a column over the latest iterations that have it; NaN if none has."""
     values = column(rows[-RECENT:], name)
@@ -128,7 +133,7 @@ def recent(rows: Sequence[Row], name: str) -> float:
 
 def recorded(rows: Sequence[Row]) -> bool:
     """Whether the last update was made by a version that records all columns."""
-    return bool(np.isfinite(float(rows[-1]["clipped"])))
+    return bool(np.isfinite(latest(rows, "clipped")))
 
 
 def weighted(rows: Sequence[Row]) -> FloatArray:
@@ -194,14 +199,9 @@ def diagnose(
     return sorted((f for f in found if f is not None), key=lambda f: order.index(f.severity))
 
 
-def least_temperature(rows: Sequence[Row]) -> float:
-    """The floor of eta that holds, which need not be the one that held before; NaN if unknown."""
-    return float(rows[-1]["eta_floor"])
-
-
 def higher_floor(rows: Sequence[Row]) -> str:
     """The setting of twice the least temperature; of 0.2 where it is not known, or was none."""
-    floor = least_temperature(rows)
+    floor = latest(rows, "eta_floor")
     return f"--set eta_floor={2.0 * floor if floor > 2.0 * ETA_LEAST else 0.2:.2g}"
 
 
@@ -403,8 +403,8 @@ def step(rows: Sequence[Row]) -> Finding:
     name = "step"
     late = rows[-RECENT:]
     share = float(np.mean(column(late, "kl") / column(late, "kl_bound")))
-    bound = float(late[-1]["kl_bound"])
-    floor = least_temperature(rows)
+    bound = latest(rows, "kl_bound")
+    floor = latest(rows, "eta_floor")
     at_floor = np.mean([row["outcome"] == Outcome.AT_FLOOR.name for row in late]) > 0.5
     if share >= BOUND_USED and still_rising(rows):
         return Finding(

@@ -174,7 +174,7 @@ def _draw_kl(axes: Axes, rows: Sequence[Row]) -> None:
 def _draw_eta(axes: Axes, rows: Sequence[Row]) -> None:
     _curve(axes, rows, column(rows, "eta"))
     axes.set_yscale("log")
-    floor = diagnosis.least_temperature(rows)
+    floor = diagnosis.latest(rows, "eta_floor")
     low, high = float(column(rows, "eta").min()), float(column(rows, "eta").max())
     if np.isfinite(floor):
         _line(axes, floor, f"floor {floor:.2g}", below=True)
@@ -209,13 +209,13 @@ def _draw_model(axes: Axes, rows: Sequence[Row]) -> None:
 def _draw_basis(axes: Axes, rows: Sequence[Row]) -> None:
     rank = column(rows, "rank")
     _curve(axes, rows, rank)
-    cap = float(rows[-1]["max_rank"])
+    cap = diagnosis.latest(rows, "max_rank")
     top = float(rank.max())
     if np.isfinite(cap):
         _line(axes, cap, f"cap {cap:.0f}")
         top = max(top, cap)
     axes.set_ylim(0.0, 1.25 * top)
-    residual = float(rows[-1]["rank_residual"])
+    residual = diagnosis.latest(rows, "rank_residual")
     fixed = diagnosis.recorded(rows) and not np.isfinite(cap)
     axes.text(
         0.99,
