@@ -17,6 +17,7 @@ from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
 from kreps.envs import swing_up
 from kreps.envs.references import REFERENCE_REWARDS
+from kreps.envs.restart import restart_length, stratified_lengths
 from kreps.envs.swing_up import SwingUp, SwingUpBatch
 from kreps.errors import ConfigurationError
 from kreps.evaluation import discounted_average, evaluation_rollouts
@@ -324,6 +325,31 @@ def test_restarts_come_after_49_steps_on_average_in_any_environment(name: str) -
     assert lengths.min() >= 1
     standard_error = np.sqrt(0.98) / 0.02 / np.sqrt(len(lengths))
     assert lengths.mean() == pytest.approx(49.0, abs=3 * standard_error)
+
+
+@pytest.mark.parametrize("probability", [0.02, 0.2])
+def test_lengths_drawn_together_are_as_random_each_and_hardly_vary_in_sum(
+    probability: float,
+) -> None:
+    together = np.array(
+        [stratified_lengths(np.random.default_rng(seed), probability, 30) for seed in range(2000)]
+    )
+    independent = np.array(
+        [restart_length(np.random.default_rng([1, i]), probability) for i in range(20_000)]
+    )
+    assert together.shape == (2000, 30) and together.min() >= 1
+    # each of them, the first as the last, has the distribution of an independent one
+    for column in (together[:, 0], together[:, 29]):
+        for share in (0.1, 0.5, 0.9):
+            limit = np.quantile(independent, share)
+            standard_error = np.sqrt(share * (1.0 - share) / len(column))
+            found, wanted = np.mean(column <= limit), np.mean(independent <= limit)
+            assert found == pytest.approx(wanted, abs=4 * standard_error)
+    # their sum varies much less, and no order is left in which they were drawn
+    sums = together.sum(axis=1)
+    assert sums.mean() == pytest.approx(30 * independent.mean(), rel=0.03)
+    assert sums.std() < 0.4 * np.sqrt(30) * independent.std()
+    assert abs(np.corrcoef(together[:, 0], together[:, 1])[0, 1]) < 0.1
 
 
 def test_restarts_are_reproducible_by_seed_and_go_on_without_one() -> None:

@@ -13,6 +13,7 @@ import kreps
 from kreps.algorithms.reps import LearnerState
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec
+from kreps.envs.restart import stratified_lengths
 from kreps.envs.swing_up import SwingUp
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
 from kreps.evaluation import discounted_average
@@ -143,6 +144,19 @@ def test_collecting_in_batches_and_step_by_step_gives_the_same_data() -> None:
         np.testing.assert_allclose(a.observations, b.observations, rtol=0, atol=1e-9)
         np.testing.assert_allclose(a.actions, b.actions, rtol=0, atol=1e-9)
         np.testing.assert_allclose(a.rewards, b.rewards, rtol=0, atol=1e-9)
+
+
+def test_lengths_are_drawn_together_where_the_settings_say_so() -> None:
+    def steps(**settings: Any) -> list[int]:
+        learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=3, initial_rollouts=30, **settings)
+        assert learner.env is not None
+        return [len(rollout) for rollout in learner._collect(learner.env, None)]
+
+    lengths = steps()
+    together = generator(3, Purpose.RESTART, 0)
+    assert lengths == stratified_lengths(together, 0.02, 30)
+    assert sum(lengths) == pytest.approx(1470, rel=0.1)
+    assert steps(restarts="independent") == steps(recipe="paper") != lengths
 
 
 @pytest.mark.parametrize("make", [lambda: gym.make("kreps/SwingUp-v0"), PointMass])

@@ -32,6 +32,7 @@ def test_the_default_recipe_asks_the_model_for_more_than_the_observed_one() -> N
         "eta_floor": 0.1,
         "exploring_starts": 0.0,
         "model": "change",
+        "restarts": "independent",
     }
     assert settings_of("default", **own) == settings_of("observed")
 
@@ -58,6 +59,7 @@ def test_the_paper_recipe_has_a_low_floor_and_hard_ranges() -> None:
     assert (paper.ridge, paper.imagined, paper.exploring_starts) == (0.1, 0, 0.0)
     assert (paper.initial_rollouts, paper.rollouts_per_iteration, paper.window) == (30, 10, 30)
     assert paper.restart_probability == 0.02
+    assert paper.restarts == "independent"
 
 
 def test_a_change_overrides_the_recipe_and_nothing_else() -> None:
@@ -84,6 +86,7 @@ def test_an_unknown_parameter_is_refused_with_the_choices() -> None:
         ("features", "RKHS"),
         ("policy_fit", "mle"),
         ("exploration", None),
+        ("restarts", "both"),
         *[
             (name, value)
             for name in ("kl_bound", "exploration_scale", "basis_tolerance")

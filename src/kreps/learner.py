@@ -324,6 +324,7 @@ class OnPolicyLearner(Learner[OnPolicy]):
             seed=self.seed,
             iteration=self.state.iteration,
             restart_probability=self.settings.restart_probability,
+            stratified=self.settings.restarts == "stratified",
             exponent=exponent,
             on_rollout=on_rollout,
         )

@@ -15,7 +15,7 @@ import numpy as np
 from kreps.arrays import FloatArray, grid_points
 from kreps.data import LARGEST, Rollout, TaskSpec, is_sane
 from kreps.envs.batch import BatchModel, SettableModel
-from kreps.envs.restart import RandomRestart, restart_length
+from kreps.envs.restart import RandomRestart, restart_length, stratified_lengths
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
 from kreps.exploration import WHITE, coloured_noise
 from kreps.policies import StochasticPolicy
@@ -113,12 +113,14 @@ def collect(
     seed: int,
     iteration: int,
     restart_probability: float,
+    stratified: bool = False,
     exponent: float = WHITE,
     on_rollout: Callable[[int], None] | None = None,
 ) -> list[Rollout]:
     """``count`` roll-outs of random length, as the paper's protocol collects them.
 
     Args:
+        stratified: whether their lengths are drawn together (`stratified_lengths`).
         exponent: of the spectrum of the policy's noise (`kreps.exploration.coloured_noise`).
         on_rollout: called with the number of roll-outs that are complete.
 
@@ -129,7 +131,11 @@ def collect(
     seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
     rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
     limit = time_limit(env)
-    drawn = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
+    if stratified:
+        together = generator(seed, Purpose.RESTART, iteration)
+        drawn = stratified_lengths(together, restart_probability, count)
+    else:
+        drawn = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
     lengths = [min(length, limit) for length in drawn]
     noises = [
         coloured_noise(exponent, length, task.action_size, rng)

@@ -13,6 +13,7 @@ from kreps.errors import ConfigurationError
 Model = Literal["dynamics", "change", "embedding", "sample"]
 Approximation = Literal["auto", "exact", "pivoted", "uniform", "fourier"]
 Features = Literal["rkhs", "grid"]
+Restarts = Literal["independent", "stratified"]
 PolicyFit = Literal["map", "bounded"]
 Exploration = Literal["bang-bang", "gaussian", "pink"]
 
@@ -73,16 +74,21 @@ class OnPolicySettings(LearnerSettings):
         initial_rollouts: roll-outs before the first update.
         rollouts_per_iteration: roll-outs before each later one, of the current policy; or at the
             limits with slow noise while no reward tells of the states.
+        restarts: lengths of these roll-outs, ``"independent"``, as printed, or ``"stratified"``: as
+            random each, but of any number of them the shortest and the longest are among them, so
+            that they have nearly as many steps as are expected.
     """
 
     exploration: Exploration = "bang-bang"
     exploration_scale: float = 1.0
     initial_rollouts: int = 30
     rollouts_per_iteration: int = 10
+    restarts: Restarts = "independent"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._choose("exploration", Exploration)
+        self._choose("restarts", Restarts)
         self._positive("exploration_scale")
         self._whole("initial_rollouts", "rollouts_per_iteration")
 
@@ -133,6 +139,7 @@ class Settings(OnPolicySettings):
             approximated; V has ``max_rank``.
     """
 
+    restarts: Restarts = "stratified"
     kl_bound: float = 1.0
     eta_floor: float | None = None
     ridge: float | None = None
@@ -261,7 +268,14 @@ class NPALPSettings(OnPolicySettings):
 
 AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
 
-OBSERVED = Settings(eta_floor=0.1, ridge=0.1, exploring_starts=0.0, imagined=0, model="change")
+OBSERVED = Settings(
+    restarts="independent",
+    eta_floor=0.1,
+    ridge=0.1,
+    exploring_starts=0.0,
+    imagined=0,
+    model="change",
+)
 
 RECIPES: dict[str, Settings] = {
     "default": Settings(),

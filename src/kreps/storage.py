@@ -79,6 +79,7 @@ ADDED_LATER: dict[str, dict[str, Any]] = {
         "imagined_noise": 1.0,
         "imagined_rollouts": 0.0,
         "judging_rollouts": 0,
+        "restarts": "independent",
     }
 }
 """Settings by method that earlier checkpoints have not, at the values that mean what these did."""

@@ -16,6 +16,17 @@ def restart_length(rng: np.random.Generator, probability: float) -> int:
     return max(1, int(rng.geometric(probability)) - 1)
 
 
+def stratified_lengths(rng: np.random.Generator, probability: float, count: int) -> list[int]:
+    """So many lengths (count,), each as likely as `restart_length`'s are, but not independent.
+
+    One is drawn from each of ``count`` equally likely ranges of lengths, in random order, so that
+    their sum is nearly what is expected: thirty independent ones have 1,470 steps give or take 270.
+    """
+    quantiles = (rng.permutation(count) + rng.random(count)) / count
+    until_restart = np.ceil(np.log1p(-quantiles) / np.log1p(-probability)).astype(int)
+    return np.maximum(until_restart - 1, 1).tolist()
+
+
 class RandomRestart(gym.Wrapper[Any, Any, Any, Any]):
     """Truncates each episode after a random number of steps, whatever the environment.
 

@@ -120,6 +120,7 @@ ABLATIONS: dict[str, Options] = {
     "ridge 0.1": {"ridge": 0.1},
     "floor 0.05": {"eta_floor": 0.05},
     "half the KL bound": {"kl_bound": 0.5},
+    "independent restarts": {"restarts": "independent"},
     "hard ranges": {"policy_fit": "bounded"},
     "changes of features embedded": {"model": "change"},
     "successor embedded": {"model": "embedding"},
@@ -162,7 +163,7 @@ BEYOND: dict[str, tuple[Curve, ...]] = {
     "ablation": tuple(("swing-up", m) for m in (DEFAULT, *ABLATIONS)),
 }
 """Experiments that are not among the paper's: run by name, not by ``all``."""
-FIRST_SEED = {"untuned": 1130, "ablation": 1130}
+FIRST_SEED = {"untuned": 1140, "ablation": 1140}
 """Of experiments that confirm what was found on others; 0 elsewhere."""
 PICTURES = ("figure-2a",)
 """Figures without an experiment: the features of the images."""
