@@ -348,8 +348,18 @@ def test_lengths_drawn_together_are_as_random_each_and_hardly_vary_in_sum(
     # their sum varies much less, and no order is left in which they were drawn
     sums = together.sum(axis=1)
     assert sums.mean() == pytest.approx(30 * independent.mean(), rel=0.03)
-    assert sums.std() < 0.4 * np.sqrt(30) * independent.std()
+    assert sums.std() < 0.25 * np.sqrt(30) * independent.std()
     assert abs(np.corrcoef(together[:, 0], together[:, 1])[0, 1]) < 0.1
+
+
+@pytest.mark.parametrize("probability", [1e-300, 1e-20, 1.0 - 1e-12])
+@pytest.mark.parametrize("count", [1, 30])
+def test_lengths_drawn_together_are_whole_numbers_whatever_the_probability(
+    probability: float, count: int
+) -> None:
+    lengths = stratified_lengths(np.random.default_rng(0), probability, count)
+    assert len(lengths) == count and all(type(length) is int for length in lengths)
+    assert min(lengths) >= (1 if probability > 0.5 else 10**15)
 
 
 def test_restarts_are_reproducible_by_seed_and_go_on_without_one() -> None:

@@ -113,6 +113,7 @@ def collected(
     seed: int = 0,
     iteration: int = 0,
     probability: float = 0.05,
+    stratified: bool = False,
 ) -> list[Rollout]:
     return collect(
         env,
@@ -122,6 +123,7 @@ def collected(
         seed=seed,
         iteration=iteration,
         restart_probability=probability,
+        stratified=stratified,
     )
 
 
@@ -157,6 +159,23 @@ def test_lengths_are_drawn_together_where_the_settings_say_so() -> None:
     assert lengths == stratified_lengths(together, 0.02, 30)
     assert sum(lengths) == pytest.approx(1470, rel=0.1)
     assert steps(restarts="independent") == steps(recipe="paper") != lengths
+    for other in (kreps.ValueIteration, kreps.NPALP):
+        assert other(gym.make("kreps/SwingUp-v0")).settings.restarts == "independent"
+
+
+def test_lengths_drawn_together_differ_between_iterations_and_end_with_a_time_limit() -> None:
+    swing_up = gym.make("kreps/SwingUp-v0")
+    batch, single, limited = (
+        [collected(env, Linear(40.0), iteration=i, stratified=True) for i in (0, 1)]
+        for env in (swing_up, gym.Wrapper(swing_up), gym.wrappers.TimeLimit(PointMass(), 4))
+    )
+    for iteration in (0, 1):
+        drawn = stratified_lengths(generator(0, Purpose.RESTART, iteration), 0.05, 6)
+        assert [len(r) for r in batch[iteration]] == drawn
+        assert [len(r) for r in limited[iteration]] == [min(length, 4) for length in drawn]
+        for a, b in zip(batch[iteration], single[iteration], strict=True):
+            np.testing.assert_allclose(a.observations, b.observations, rtol=0, atol=1e-9)
+    assert [len(r) for r in batch[0]] != [len(r) for r in batch[1]]
 
 
 @pytest.mark.parametrize("make", [lambda: gym.make("kreps/SwingUp-v0"), PointMass])
@@ -178,7 +197,7 @@ def test_data_match_an_independent_simulation(make: Any) -> None:
         np.testing.assert_allclose(rollout.observations[-1], observation, rtol=0, atol=1e-9)
 
 
-def test_lengths_are_those_of_the_restart_wrapper_with_the_same_seeds() -> None:
+def test_independent_lengths_are_those_of_the_restart_wrapper_with_the_same_seeds() -> None:
     rollouts = collected(PointMass(), Linear(1.0), seed=7, probability=0.1)
     env = kreps.RandomRestart(PointMass(), 0.1)
     for j, rollout in enumerate(rollouts):
@@ -205,7 +224,7 @@ def test_seed_and_iteration_and_rollout_each_change_the_data() -> None:
     assert len(starts) == len(first)
 
 
-def test_the_first_rollouts_do_not_depend_on_how_many_follow() -> None:
+def test_the_first_rollouts_of_independent_lengths_do_not_depend_on_how_many_follow() -> None:
     few, many = collected(PointMass(), Linear(1.0), 2), collected(PointMass(), Linear(1.0), 5)
     for a, b in zip(few, many, strict=False):
         np.testing.assert_array_equal(a.observations, b.observations)

@@ -931,6 +931,7 @@ def test_checkpoints_of_before_a_setting_was_there_keep_their_meaning(
         "imagined_noise": 1.0,
         "imagined_rollouts": 0.0,
         "judging_rollouts": 0,
+        "restarts": "independent",
     }
     for name in set(later) - set(changes):
         del settings[name]

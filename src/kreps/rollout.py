@@ -1,6 +1,7 @@
 """Collects roll-outs: in batches where the task offers them, step by step from any environment.
 
-Both ways address their randomness by roll-out, so they give the same data from the same seed.
+Both ways address their randomness by roll-out, and lengths that are drawn together by batch, so
+they give the same data from the same seed.
 """
 
 from __future__ import annotations
@@ -117,10 +118,11 @@ def collect(
     exponent: float = WHITE,
     on_rollout: Callable[[int], None] | None = None,
 ) -> list[Rollout]:
-    """``count`` roll-outs of random length, as the paper's protocol collects them.
+    """``count`` roll-outs of random length.
 
     Args:
-        stratified: whether their lengths are drawn together (`stratified_lengths`).
+        stratified: whether their lengths are drawn together (`stratified_lengths`), so that they
+            depend on how many there are; else each is that of `RandomRestart` with its seed.
         exponent: of the spectrum of the policy's noise (`kreps.exploration.coloured_noise`).
         on_rollout: called with the number of roll-outs that are complete.
 

@@ -75,8 +75,8 @@ class OnPolicySettings(LearnerSettings):
         rollouts_per_iteration: roll-outs before each later one, of the current policy; or at the
             limits with slow noise while no reward tells of the states.
         restarts: lengths of these roll-outs, ``"independent"``, as printed, or ``"stratified"``: as
-            random each, but of any number of them the shortest and the longest are among them, so
-            that they have nearly as many steps as are expected.
+            random each, but one from each of as many equally likely ranges of lengths, so that a
+            batch has nearly as many steps as are expected.
     """
 
     exploration: Exploration = "bang-bang"
