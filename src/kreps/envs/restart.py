@@ -26,6 +26,7 @@ def stratified_lengths(rng: np.random.Generator, probability: float, count: int)
     their sum is nearly what is expected.  At p = 0.02 thirty have 1,470 steps give or take 50, and
     270 if they are independent; ten have 490, give or take 50 too: it is of the last range.
     """
+    # scipy.stats.qmc.LatinHypercube draws alike, but its import takes longer than that of kreps
     survivals = (count - rng.permutation(count) - rng.random(count)) / count
     until_restart = np.ceil(np.log(survivals) / np.log1p(-probability))
     return np.clip(until_restart - 1.0, 1.0, LONGEST).astype(np.int64).tolist()
