@@ -18,9 +18,16 @@ from kreps import policies
 from kreps.algorithms import low_rank_reps, reps
 from kreps.algorithms.boldness import ETA_FLOOR_JUDGED, ETA_FLOOR_NOT_JUDGED
 from kreps.algorithms.dynamics import TREND_SAMPLES, Dynamics, Motion, fit_dynamics
-from kreps.algorithms.imagined_rollouts import AVERAGED, Followed, Simulator, can_be_simulated
+from kreps.algorithms.imagined_rollouts import (
+    AVERAGED,
+    Followed,
+    Simulator,
+    average_reward,
+    can_be_simulated,
+)
 from kreps.algorithms.imagined_step import Outlook, imagine
 from kreps.algorithms.judgement import refuses
+from kreps.algorithms.optimism import Optimism
 from kreps.algorithms.reps import UpdateInfo
 from kreps.algorithms.transition_model import feature_differences
 from kreps.arrays import FloatArray
@@ -428,7 +435,7 @@ def averaged(
     typical: float = 1.0,
 ) -> FloatArray:
     followed = made.follow(policy, reward, count, np.random.default_rng(seed))
-    return followed.average_reward(made.restart_probability, least, typical)
+    return average_reward(followed.feared_rewards(least, typical), made.restart_probability)
 
 
 def test_a_step_counts_by_the_chance_that_no_restart_came_before_it() -> None:
@@ -524,6 +531,7 @@ def judged(new: Any, before: Any, count: int = 100, seed: int = 0, **changes: An
         expect=lambda rows, inputs: inputs,
         reward=lambda inputs: inputs[:, :1],
         simulator=fixed,
+        optimism=None,
     )
     rng = np.random.default_rng(seed)
     settings = settings_of(judging_rollouts=count)
@@ -550,6 +558,12 @@ def test_a_policy_that_leaves_what_is_known_is_refused() -> None:
     # but where no two states are alike, the states of the policy before are the measure
     assert judged(Risky(2.0, likeness=1e-3), Risky(1.0, likeness=1e-3)) is False
     assert judged(Risky(2.0, likeness=0.0), Risky(1.0, likeness=0.0)) is False
+
+
+def test_an_optimist_is_judged_by_what_it_hopes_for() -> None:
+    hope = Optimism(strength=1.0, best=100.0, edge=0.1)
+    assert judged(Risky(0.5, likeness=0.5), Risky(1.0), optimism=hope) is False
+    assert judged(Risky(0.5), Risky(1.0), optimism=hope) is True  # there it is known
 
 
 def test_without_a_policy_before_or_a_simulator_nothing_is_judged() -> None:

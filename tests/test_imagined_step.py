@@ -165,6 +165,7 @@ class Case:
             expect=self.expectation.of_actions,
             reward=self.reward if reward is None else reward,
             simulator=None,
+            optimism=None,
         )
 
     def imagined(

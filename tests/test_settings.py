@@ -104,6 +104,7 @@ def test_an_unknown_parameter_is_refused_with_the_choices() -> None:
             for name in ("exploring_starts", "imagined_rollouts")
             for value in (-0.1, 1.1, float("nan"), "1", True, None)
         ],
+        *[("optimism", value) for value in (-0.1, float("inf"), float("nan"), "1", True, None)],
         *[("eta_floor", value) for value in (-1e-9, float("inf"), float("nan"), "0", False)],
         *[("restart_probability", value) for value in (0.0, 1.0, -0.1, 1.5, float("nan"), "0.1")],
         *[
@@ -144,6 +145,8 @@ def test_a_value_out_of_range_is_refused_by_name(name: str, value: Any) -> None:
         ("imagined_rollouts", 1.0),
         ("judging_rollouts", 0),
         ("judging_rollouts", 2),
+        ("optimism", 0),
+        ("optimism", 10.0),
         ("imagined", 1),
         ("model", "embedding"),
         ("features", "grid"),

@@ -932,6 +932,7 @@ def test_checkpoints_of_before_a_setting_was_there_keep_their_meaning(
         "imagined_rollouts": 0.0,
         "judging_rollouts": 0,
         "restarts": "independent",
+        "optimism": 0.0,
     }
     for name in set(later) - set(changes):
         del settings[name]

@@ -80,6 +80,7 @@ ADDED_LATER: dict[str, dict[str, Any]] = {
         "imagined_rollouts": 0.0,
         "judging_rollouts": 0,
         "restarts": "independent",
+        "optimism": 0.0,
     }
 }
 """Settings by method that earlier checkpoints have not, at the values that mean what these did."""

@@ -48,23 +48,30 @@ class Followed:
     rewards: FloatArray
     likeness: FloatArray
 
-    def average_reward(
-        self, restart_probability: float, least: float, typical: float
-    ) -> FloatArray:
-        """Average reward per step (count,) of the restarting process, from each start.
+    def feared_rewards(self, least: float, typical: float) -> FloatArray:
+        """Rewards (steps, count) if what is not known is the worst.
 
-        A step counts by the chance that there has been no restart yet.  And what is not known is
-        the worst: the less a state is like any sample, the nearer its reward is taken to be to the
-        least one.
+        The less a state is like any sample, the nearer its reward is taken to be to the least one.
 
         Args:
-            restart_probability: p.
             least: of all rewards, standardised.
             typical: likeness from which on a state is known.
         """
-        share = (1.0 - restart_probability) ** np.arange(len(self.rewards))
         known = np.minimum(self.likeness / typical, 1.0)
-        return share @ (least + known * (self.rewards - least)) / share.sum()
+        return least + known * (self.rewards - least)
+
+
+def average_reward(rewards: FloatArray, restart_probability: float) -> FloatArray:
+    """Average reward per step (count,) of the restarting process, from each start.
+
+    A step counts by the chance that there has been no restart yet.
+
+    Args:
+        rewards: (steps, count) without restarts.
+        restart_probability: p.
+    """
+    share = (1.0 - restart_probability) ** np.arange(len(rewards))
+    return share @ rewards / share.sum()
 
 
 @dataclass(frozen=True)
@@ -151,7 +158,7 @@ class Simulator:
         (m, ds + da), successors (m, ds) within the range of the data, and whether the task ended
         (m,).
         """
-        rows, likeness = self._nearest(states)
+        rows, likeness = self.nearest(states)
         noise = rng.standard_normal((len(states), self.task.action_size))
         actions = self.task.scaled(self.task.clip(policy.act(states, noise)))
         inputs = np.concatenate([states, actions], axis=1)
@@ -167,7 +174,7 @@ class Simulator:
         centred = coordinates - mean
         return mean, centred, 0.5 * np.sum(centred * centred, axis=1)
 
-    def _nearest(self, states: FloatArray) -> tuple[IntArray, FloatArray]:
+    def nearest(self, states: FloatArray) -> tuple[IntArray, FloatArray]:
         """The nearest samples (m,) to states (m, ds), and the kernel's values (m,) with them.
 
         ``argmin |e_i - f_j|^2`` is ``argmax e_i'f_j - |f_j|^2 / 2``.

@@ -20,6 +20,7 @@ import numpy as np
 
 from kreps.algorithms.boldness import is_judged, least_temperature, widening
 from kreps.algorithms.imagined_rollouts import Simulator
+from kreps.algorithms.optimism import Optimism
 from kreps.algorithms.transition_model import feature_differences
 from kreps.arrays import FloatArray, IntArray
 from kreps.data import TaskSpec
@@ -45,6 +46,7 @@ class Outlook:
             or, if simulated, nearest to, and of states and scaled, applied actions (m, ds + da).
         reward: what reward (m, 1) is to be expected of such states and actions, from its mean.
         simulator: tells where a policy leads; None if the model does not.
+        optimism: about what no sample is like; None if there is none.
     """
 
     states: FloatArray
@@ -55,6 +57,7 @@ class Outlook:
     expect: Callable[[IntArray, FloatArray], FloatArray]
     reward: Callable[[FloatArray], FloatArray]
     simulator: Simulator | None
+    optimism: Optimism | None
 
     def rewards_of(self, inputs: FloatArray) -> FloatArray:
         """Expected rewards (m,), standardised, of states and scaled, applied actions (m, ds + da).
@@ -63,6 +66,14 @@ class Outlook:
         """
         said = self.rewards.mean() + self.reward(inputs)[:, 0]
         return np.clip(said, self.rewards.min(), self.rewards.max())
+
+    def hoped_rewards_of(self, inputs: FloatArray) -> FloatArray:
+        """The same (m,), and more for actions that lead to where nothing is known."""
+        rewards = self.rewards_of(inputs)
+        if self.simulator is None or self.optimism is None:
+            return rewards
+        _, likeness = self.simulator.nearest(self.simulator.dynamics.predicted(inputs)[0])
+        return rewards + self.optimism.bonus(rewards, likeness)
 
 
 @dataclass(frozen=True)
@@ -123,7 +134,7 @@ def imagine(
     noise = widening(judged, settings) * rng.standard_normal((count, task.action_size))
     actions = policy.act(states[of], noise)
     inputs = np.concatenate([states[of], task.scaled(task.clip(actions))], axis=1)
-    rewards = outlook.rewards_of(inputs)
+    rewards = outlook.hoped_rewards_of(inputs)
     problem = DualProblem(
         rewards=rewards - rewards.max(),
         differences=feature_differences(

@@ -9,6 +9,7 @@ Of states that no sample is like, the model would say that rewards are as they a
 late in learning is good.  A policy that goes there on purpose was never seen to: the judge takes
 what is not known for the worst that was.  How like the samples a state has to be is told by those
 of the policy before, most of which are known: in many coordinates no two states are much alike.
+Only while there is optimism (`kreps.algorithms.optimism`) the judge shares it.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from kreps.algorithms.imagined_rollouts import average_reward
 from kreps.algorithms.imagined_step import Outlook
 from kreps.policies import StochasticPolicy
 from kreps.settings import Settings
@@ -52,7 +54,12 @@ def refuses(
     )
     typical = max(float(np.median(followed_before.likeness)), np.finfo(np.float64).tiny)
     earned, earned_before = (
-        each.average_reward(process.restart_probability, outlook.rewards.min(), typical)
+        average_reward(
+            each.feared_rewards(outlook.rewards.min(), typical)
+            if outlook.optimism is None
+            else each.rewards + outlook.optimism.bonus(each.rewards, each.likeness),
+            process.restart_probability,
+        )
         for each in (followed, followed_before)
     )
     gain = earned - earned_before

@@ -33,6 +33,7 @@ from kreps.algorithms.chunk_sums import (
 from kreps.algorithms.dynamics import Dynamics, Motion, after_ends, observed_expectation
 from kreps.algorithms.imagined_step import Outlook, imagine
 from kreps.algorithms.judgement import refuses
+from kreps.algorithms.optimism import optimism_of
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
     Expectation,
@@ -215,6 +216,7 @@ def update(
             expect=expectation.of_actions,
             reward=regression.mean,
             simulator=simulator,
+            optimism=optimism_of(simulator, rewards[sampled], state.iteration, settings),
         )
         share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)

@@ -14,6 +14,7 @@ from kreps.algorithms.dynamics import Dynamics, fit_dynamics, observed_expectati
 from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
 from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
 from kreps.algorithms.judgement import refuses
+from kreps.algorithms.optimism import optimism_of
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
     feature_differences,
@@ -198,6 +199,7 @@ def update(
             expect=expectation.of_actions,
             reward=regression.predictor(targets),
             simulator=simulator,
+            optimism=optimism_of(simulator, rewards, state.iteration, settings),
         )
         imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
         # V is nearly known, the temperature is to be found anew: it may have to rise

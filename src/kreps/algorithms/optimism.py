@@ -1,0 +1,89 @@
+"""What is not known is thought to be good: the optimism of R-max (Brafman and Tennenholtz 2002).
+
+A policy that holds the best state it has seen makes no other data, and what it has never seen is
+not imagined either: a local optimum is for ever.  So in the model what no sample is like has the
+best reward that is known, and more, until somebody has been there.  What is like the samples is
+told by the samples: nearly all of them have one of another roll-out within a certain distance, and
+what is farther off is unknown, the farther the more.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from kreps.algorithms.imagined_rollouts import Simulator
+from kreps.arrays import FloatArray
+from kreps.settings import Settings
+
+KEPT = 0.7
+"""What is left of the optimism after each update: later, what is not known was passed by."""
+
+LEAST = 0.05
+"""Less optimism is none."""
+
+HIGHEST = 2.0
+"""Deviations of the reward above its mean that are hoped for at most: where the best reward is a
+seldom goal, not all that is unknown is another one."""
+
+KNOWN = 0.9
+"""Share of the samples that are known from other roll-outs."""
+
+ROUNDING = 1e-12
+"""Least distance that is known: states that are equal but for rounding are."""
+
+_TINY = float(np.finfo(np.float64).tiny)
+
+
+@dataclass(frozen=True)
+class Optimism:
+    """What is added to expected rewards where nothing is known.
+
+    Attributes:
+        strength: share of the way to the best reward that is added at most; it may be above 1.
+        best: reward that is hoped for, standardised.
+        edge: half the squared distance, in lengthscales, up to which a state is known.
+    """
+
+    strength: float
+    best: float
+    edge: float
+
+    def bonus(self, rewards: FloatArray, likeness: FloatArray) -> FloatArray:
+        """For expected rewards, by the likeness of states to the nearest sample; any one shape."""
+        far = -np.log(np.maximum(likeness, _TINY))
+        unknown = -np.expm1(-np.maximum(far - self.edge, 0.0) / self.edge)
+        return self.strength * unknown * np.maximum(self.best - rewards, 0.0)
+
+
+def optimism_of(
+    simulator: Simulator | None, rewards: FloatArray, updates: int, settings: Settings
+) -> Optimism | None:
+    """Of an update after so many, from rewards (n,), standardised; None where there is none."""
+    strength = settings.optimism * KEPT**updates
+    if simulator is None or strength < LEAST:
+        return None
+    edge = known_distance(simulator)
+    if edge is None:
+        return None
+    best = min(float(rewards.max()), float(rewards.mean()) + HIGHEST * float(rewards.std()))
+    return Optimism(strength, best, edge)
+
+
+def known_distance(simulator: Simulator) -> float | None:
+    """Half the squared distance, in lengthscales, that `KNOWN` of the samples have another within.
+
+    Those of its own roll-out do not count, as they are near in any case.  None if there is no
+    other roll-out.
+    """
+    data = simulator.data
+    of = np.searchsorted(data.start, data.state, side="right")
+    if not of.any():  # drawn one by one from many roll-outs, hardly two from the same
+        of = np.arange(len(data))
+    if of[0] == of[-1]:
+        return None
+    likeness = simulator.kernel.gram(data.states, data.states)
+    likeness[of[:, None] == of] = 0.0
+    nearest = likeness.max(axis=1)
+    return max(-float(np.log(max(np.quantile(nearest, 1.0 - KNOWN), _TINY))), ROUNDING)

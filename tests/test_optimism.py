@@ -1,0 +1,122 @@
+"""What is not known is thought to be good, and what is known is not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import kreps
+from kreps.algorithms.optimism import HIGHEST, KEPT, LEAST, Optimism, known_distance, optimism_of
+from kreps.data import Rollout, TaskSpec, Transitions
+from kreps.kernels import Kernel
+
+TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
+KERNEL = Kernel(TASK.state_factors, np.array([0.5, 2.0]))
+
+
+def rollouts(count: int, seed: int = 0) -> list[Rollout]:
+    rng = np.random.default_rng(seed)
+    return [
+        Rollout(rng.standard_normal((n + 1, 2)), np.zeros((n, 1)), rng.standard_normal(n))
+        for n in rng.integers(3, 9, count)
+    ]
+
+
+def simulator(data: Transitions) -> Any:
+    return SimpleNamespace(data=data, kernel=KERNEL)
+
+
+def half_squared_distance(a: np.ndarray, b: np.ndarray) -> float:
+    return 0.5 * float(np.sum(((a - b) / KERNEL.lengthscales) ** 2))
+
+
+def test_nearly_all_samples_have_one_of_another_rollout_within_the_known_distance() -> None:
+    made = rollouts(6)
+    nearest = [
+        min(half_squared_distance(s, t) for o in made if o is not r for t in o.observations[:-1])
+        for r in made
+        for s in r.observations[:-1]
+    ]
+    likeness = np.exp(-np.array(nearest))
+    found = known_distance(simulator(Transitions.of(made)))
+    assert found == pytest.approx(-np.log(np.quantile(likeness, 0.1)), rel=1e-9)
+    assert np.mean(np.array(nearest) <= found) == pytest.approx(0.9, abs=0.03)
+
+
+def test_samples_drawn_one_by_one_are_each_on_their_own() -> None:
+    data = Transitions.of(rollouts(40))
+    drawn = data.rows(np.arange(0, len(data), 5))
+    likeness = KERNEL.gram(drawn.states, drawn.states)
+    np.fill_diagonal(likeness, 0.0)
+    wanted = -np.log(np.quantile(likeness.max(axis=1), 0.1))
+    assert known_distance(simulator(drawn)) == pytest.approx(wanted, rel=1e-12)
+
+
+def test_one_rollout_says_nothing_of_what_is_known() -> None:
+    alone = simulator(Transitions.of(rollouts(1)))
+    assert known_distance(alone) is None
+    assert optimism_of(alone, np.arange(3.0), 0, kreps.Settings(optimism=2.0)) is None
+
+
+def test_equal_states_leave_an_edge_above_zero() -> None:
+    same = [Rollout(np.zeros((4, 2)), np.zeros((3, 1)), np.zeros(3))] * 3
+    found = known_distance(simulator(Transitions.of(same)))
+    assert found is not None and found > 0.0
+    bonus = Optimism(1.0, 5.0, found).bonus(np.zeros(3), np.array([1.0, 0.99, 0.0]))
+    np.testing.assert_array_equal(bonus, [0.0, 5.0, 5.0])
+
+
+def test_what_is_unknown_earns_more_and_what_is_known_does_not() -> None:
+    hope = Optimism(strength=2.0, best=1.0, edge=0.5)
+    far = np.array([[0.0, 0.5, 0.6, 1.0], [2.0, 50.0, 1e4, 0.4]])
+    found = hope.bonus(np.full(far.shape, -3.0), np.exp(-far))
+    wanted = 2.0 * (1.0 - np.exp(-np.maximum(far - 0.5, 0.0) / 0.5)) * 4.0
+    np.testing.assert_allclose(found, wanted, atol=1e-14)
+    assert found[0, :2].tolist() == [0.0, 0.0] and found[1, 2] == 8.0
+    np.testing.assert_array_equal(hope.bonus(np.array([1.0, 7.0]), np.zeros(2)), [0.0, 0.0])
+
+
+def test_optimism_falls_at_each_update_and_ends() -> None:
+    data = simulator(Transitions.of(rollouts(5)))
+    settings = kreps.Settings(optimism=2.0)
+    rewards = np.arange(9.0)
+    strengths = []
+    while (hope := optimism_of(data, rewards, len(strengths), settings)) is not None:
+        strengths.append(hope.strength)
+    np.testing.assert_allclose(strengths, 2.0 * KEPT ** np.arange(len(strengths)))
+    assert strengths[-1] >= LEAST > KEPT * strengths[-1]
+    assert optimism_of(None, rewards, 0, settings) is None
+    assert optimism_of(data, rewards, 0, replace(settings, optimism=0.0)) is None
+
+
+def test_a_seldom_goal_is_not_hoped_for_everywhere() -> None:
+    data = simulator(Transitions.of(rollouts(5)))
+    settings = kreps.Settings(optimism=2.0)
+    often, seldom = np.array([0.0, 1.0] * 50), np.array([0.0] * 99 + [100.0])
+    hopes = [optimism_of(data, rewards, 0, settings) for rewards in (often, seldom)]
+    assert [hope.best for hope in hopes if hope is not None] == [
+        1.0,
+        pytest.approx(seldom.mean() + HIGHEST * seldom.std()),
+    ]
+
+
+def visited_height(optimism: float) -> float:
+    """The angle from the top that an eighth of the second batch's states are within."""
+    learner = kreps.KREPS(
+        gym.make("kreps/SwingUp-v0"), seed=248, exploration="gaussian", optimism=optimism
+    )
+    learner.learn(2, progress=False)
+    newest = learner.state.window.rollouts[-10:]
+    angles = np.abs(np.concatenate([rollout.observations[:, 0] for rollout in newest]))
+    return float(np.quantile(angles, 0.125))
+
+
+def test_an_optimist_goes_where_it_has_not_been() -> None:
+    # white noise showed nothing of the height, and what was learnt of that holds the lean
+    assert visited_height(0.0) > 1.6
+    assert visited_height(3.0) < 1.4
