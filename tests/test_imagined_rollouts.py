@@ -340,7 +340,7 @@ def test_each_state_has_its_own_features_and_the_noise_of_its_sample(
     known: Any = Known()
     settings = settings_of(imagined=2, imagined_rollouts=0.25)
     found = imagine(
-        replace(outlook, simulator=known, expect=expect),
+        replace(outlook, simulator=known, optimism=None, expect=expect),
         np.full(n, 1.0 / n),
         Push(),
         TASK,

@@ -121,6 +121,7 @@ ABLATIONS: dict[str, Options] = {
     "floor 0.05": {"eta_floor": 0.05},
     "half the KL bound": {"kl_bound": 0.5},
     "independent restarts": {"restarts": "independent"},
+    "no optimism": {"optimism": 0.0},
     "hard ranges": {"policy_fit": "bounded"},
     "changes of features embedded": {"model": "change"},
     "successor embedded": {"model": "embedding"},
@@ -163,7 +164,7 @@ BEYOND: dict[str, tuple[Curve, ...]] = {
     "ablation": tuple(("swing-up", m) for m in (DEFAULT, *ABLATIONS)),
 }
 """Experiments that are not among the paper's: run by name, not by ``all``."""
-FIRST_SEED = {"untuned": 1140, "ablation": 1140}
+FIRST_SEED = {"untuned": 1150, "ablation": 1150}
 """Of experiments that confirm what was found on others; 0 elsewhere."""
 PICTURES = ("figure-2a",)
 """Figures without an experiment: the features of the images."""
