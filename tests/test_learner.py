@@ -482,10 +482,10 @@ def test_evaluation_agrees_with_the_riccati_equation() -> None:
 def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem(
     recipe: str,
 ) -> None:
-    # Measured over seeds 0 to 7: with the recipe "observed" the cost is 1.02 to 1.10 of the optimum
-    # for seven, 1.32 for one.  With the default it is 1.01 to 1.08 for seven and 1.21 for one after
-    # six updates, and 1.01 to 1.24 after ten.  The first policy costs 54 times the optimum, doing
-    # nothing 4.6.
+    # Measured over seeds 0 to 7: with the recipe "observed" the cost is 1.02 to 1.11 of the optimum
+    # for seven, 1.32 for one.  With the default it is 1.01 to 1.14; after six updates, when it has
+    # just looked around, 1.01 to 1.16 for seven and 1.67 for one.  The first policy costs 54 times
+    # the optimum, doing nothing 4.6.
     _, best = optimum()
     shares = []
     for seed in range(5):
@@ -499,7 +499,7 @@ def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem(
             rollouts_per_iteration=20,
             window=40,
         )
-        learner.learn(6, progress=False)
+        learner.learn(10, progress=False)
         assert learner.state.policy is not None
         shares.append(earned(learner.task, Greedy(learner.state.policy)) / best)
     first = earned(TaskSpec(2, [-4.0], [4.0]), Gaussian(TaskSpec(2, [-4.0], [4.0]), 1.0)) / best

@@ -18,7 +18,7 @@ import numpy as np
 from kreps.algorithms.dynamics import TREND_SAMPLES, Dynamics
 from kreps.arrays import BoolArray, FloatArray, IntArray
 from kreps.data import TaskSpec, Transitions
-from kreps.kernels import Kernel
+from kreps.kernels import PANEL, Kernel
 from kreps.policies import StochasticPolicy
 
 AVERAGED = 2.0
@@ -167,22 +167,33 @@ class Simulator:
         return rows, likeness, inputs, np.clip(successors, *self._range), ended
 
     @cached_property
-    def _samples(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Mean (e,) of the samples' coordinates, distances (n, e) from it, half their squares."""
+    def _samples(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (e,) of the samples' coordinates, and what `nearest` multiplies by (e + 1, n).
+
+        These are their distances from it, and minus half their squares.
+        """
         coordinates = self.kernel.embed(self.data.states)
         mean = coordinates.mean(axis=0)
         centred = coordinates - mean
-        return mean, centred, 0.5 * np.sum(centred * centred, axis=1)
+        half_squares = 0.5 * np.sum(centred * centred, axis=1, keepdims=True)
+        return mean, np.ascontiguousarray(np.concatenate([centred, -half_squares], axis=1).T)
 
     def nearest(self, states: FloatArray) -> tuple[IntArray, FloatArray]:
         """The nearest samples (m,) to states (m, ds), and the kernel's values (m,) with them.
 
         ``argmin |e_i - f_j|^2`` is ``argmax e_i'f_j - |f_j|^2 / 2``.
         """
-        mean, centred, half_squares = self._samples
+        mean, samples = self._samples
         embedded = self.kernel.embed(states) - mean
-        rows = np.argmax(embedded @ centred.T - half_squares, axis=1)
-        apart = embedded - centred[rows]
+        extended = np.concatenate([embedded, np.ones((len(embedded), 1))], axis=1)
+        tall = max(1, PANEL // samples.shape[1])  # few enough that the products stay in the cache
+        rows = np.concatenate(
+            [
+                np.argmax(extended[i : i + tall] @ samples, axis=1)
+                for i in range(0, max(1, len(extended)), tall)
+            ]
+        )
+        apart = embedded - samples[:-1, rows].T
         return rows, np.exp(-0.5 * np.sum(apart * apart, axis=1))
 
     def _starts(self, count: int, rng: np.random.Generator) -> FloatArray:

@@ -17,7 +17,7 @@ from kreps.algorithms.imagined_rollouts import Simulator
 from kreps.arrays import FloatArray
 from kreps.settings import Settings
 
-KEPT = 0.7
+KEPT = 0.35
 """What is left of the optimism after each update: later, what is not known was passed by."""
 
 LEAST = 0.05
