@@ -1,0 +1,137 @@
+"""CPU and wall seconds of kreps and of SAC for the same steps, one after the other on one machine.
+
+    .venv-peers/bin/python benchmarks/peers_seconds.py --seeds 0
+
+Writes ``results/peers-seconds.json`` and ``.md``.  `peers.py` compares what is learnt; seconds that
+were taken on different days compare machines as well.  Here each task is learnt by one and then by
+the other, each in a new process on one thread, up to the same 8000 environment steps and without
+any evaluation.  Settings and environments are those of `peers.py`, of kreps none: ``KREPS(env)``.
+A learner that works in batches is charged for those that end by then.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from itertools import groupby
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from peers import MARKS, TASKS, Cell, Stopwatch, model_of, positive, seeds_of, write
+
+import kreps
+from kreps.experiments.runner import commit
+from kreps.experiments.tables import markdown
+from kreps.runs import versions
+from kreps.threads import blas_threads
+
+LEARNERS = ("kreps", "sac")
+
+
+def seconds_of_kreps(task: str, seed: int, steps: int) -> tuple[float, float]:
+    """CPU and wall seconds of the updates, and their roll-outs, that end by so many steps."""
+    learner = kreps.KREPS(gym.make(TASKS[task].environment), seed=seed)
+    watch = Stopwatch()
+    by_then = (0.0, 0.0)
+    while True:
+        learner.learn(1, progress=False)
+        if learner.state.steps > steps:
+            return by_then
+        with watch.paused() as now:
+            by_then = now
+
+
+def seconds_of_sac(task: str, seed: int, steps: int) -> tuple[float, float]:
+    """The same of SAC, which learns after each step or each few."""
+    import torch
+
+    torch.set_num_threads(1)
+    with blas_threads(1):
+        model = model_of(Cell(task, "sac", seed, (steps,)))
+        watch = Stopwatch()
+        model.learn(steps)
+        with watch.paused() as now:
+            return now
+
+
+def row(learner: str, task: str, seed: int, steps: int) -> dict[str, Any]:
+    """Measured here, in a process of its own."""
+    measure = {"kreps": seconds_of_kreps, "sac": seconds_of_sac}[learner]
+    cpu, wall = measure(task, seed, steps)
+    return {
+        "task": task,
+        "learner": learner,
+        "seed": seed,
+        "cpu_seconds": cpu,
+        "wall_seconds": wall,
+    }
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Means over seeds as Markdown, a line for each task."""
+    lines = []
+    for task, of_task in groupby(sorted(rows, key=lambda r: [*TASKS].index(r["task"])), by_task):
+        found = list(of_task)
+        cpu, wall = (
+            {
+                learner: float(np.mean([r[name] for r in found if r["learner"] == learner]))
+                for learner in LEARNERS
+            }
+            for name in ("cpu_seconds", "wall_seconds")
+        )
+        lines.append(
+            [
+                task,
+                str(len(found) // len(LEARNERS)),
+                *(f"{cpu[learner]:.1f} / {wall[learner]:.1f}" for learner in LEARNERS),
+                f"{cpu['sac'] / cpu['kreps']:.1f} / {wall['sac'] / wall['kreps']:.1f}",
+            ]
+        )
+    head = ["task", "seeds", "kreps, CPU / wall s", "SAC, CPU / wall s", "ratio, CPU / wall"]
+    return markdown(head, lines)
+
+
+def by_task(measured: dict[str, Any]) -> str:
+    return str(measured["task"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--tasks",
+        nargs="+",
+        choices=TASKS,
+        default=list(TASKS),
+        help="default: all",
+        metavar="TASK",
+    )
+    parser.add_argument("--seeds", type=seeds_of, default=range(1), help="such as 0 or 0-2")
+    parser.add_argument("--steps", type=positive, default=MARKS[-1], help=f"default: {MARKS[-1]}")
+    parser.add_argument("--out", type=Path, default=Path("results"), help="default: results")
+    options = parser.parse_args()
+    rows = []
+    for task in options.tasks:
+        for seed in options.seeds:
+            for learner in LEARNERS:
+                with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
+                    rows.append(alone.submit(row, learner, task, seed, options.steps).result())
+                print(rows[-1], flush=True)
+    about = {
+        "command": f"python benchmarks/peers_seconds.py --seeds {options.seeds[0]}-"
+        f"{options.seeds[-1]} --steps {options.steps} --tasks {' '.join(options.tasks)}",
+        "commit": commit(),
+        "versions": versions(),
+    }
+    write(options.out / "peers-seconds.json", {**about, "rows": rows}, indent=1)
+    (options.out / "peers-seconds.md").write_text(table(rows) + "\n")
+    print(table(rows))
+
+
+if __name__ == "__main__":
+    main()
