@@ -5,6 +5,7 @@
 It reads ``results/peers.json`` (Stable-Baselines3, by ``benchmarks/peers.py``), ``untuned.csv``
 (``kreps reproduce untuned``) and ``figure-1b.csv`` (REPS on fixed features, ``kreps reproduce
 figure-1b``).  Every entry is of the policy learnt from at most so many steps.
+CPU seconds of different days are of different loads of the machine: `peers_seconds.py` compares.
 """
 
 from __future__ import annotations
@@ -56,13 +57,12 @@ def of_peers(task: str, learner: str) -> list[Curve]:
     return [[r for r in mine if r["seed"] == seed] for seed in sorted({r["seed"] for r in mine})]
 
 
-def line(task: str, name: str, curves: list[Curve], seconds: Sequence[float], least: float) -> Any:
+def line(task: str, name: str, curves: list[Curve], seconds: Sequence[float]) -> Any:
     read = [
         f"{read_off(curves, 'stochastic', mark)} / {read_off(curves, 'greedy', mark)}"
         for mark in MARKS
     ]
-    cost = float(np.mean(seconds))
-    return [task, name, str(len(curves)), *read, f"{cost:.0f}", f"{cost / least:.1f}"]
+    return [task, name, str(len(curves)), *read, f"{np.mean(seconds):.0f}"]
 
 
 def table() -> str:
@@ -71,18 +71,17 @@ def table() -> str:
     for task, ours in TASKS.items():
         curves = of_kreps("untuned.csv", ours, None)
         mine = [cpu_seconds(curve) for curve in curves]
-        least = float(np.mean(mine))
-        lines.append(line(task, "kreps, untuned", curves, mine, least))
+        lines.append(line(task, "kreps, untuned", curves, mine))
         if task == "swing-up":
             features = of_kreps("figure-1b.csv", task, FEATURES)
             seconds = [cpu_seconds(curve) for curve in features]
-            lines.append(line(task, f"{FEATURES} (seeds 0 to 9)", features, seconds, least))
+            lines.append(line(task, f"{FEATURES} (seeds 0 to 9)", features, seconds))
         for learner in ("sac", "ppo"):
             if curves := of_peers(task, learner):
                 seconds = [at_most(curve, MARKS[-1])["cpu_seconds"] for curve in curves]
-                lines.append(line(task, learner.upper(), curves, seconds, least))
+                lines.append(line(task, learner.upper(), curves, seconds))
     marks = [f"{mark} steps" for mark in MARKS]
-    return markdown(["task", "learner", "seeds", *marks, "CPU s", "times ours"], lines)
+    return markdown(["task", "learner", "seeds", *marks, "CPU s"], lines)
 
 
 if __name__ == "__main__":
