@@ -17,6 +17,7 @@ from kreps.experiments.search import search_table
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "benchmarks")]
+import peers_seconds  # noqa: E402
 import peers_table  # noqa: E402
 from fill_tables import filled  # noqa: E402
 
@@ -88,6 +89,9 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
             assert table == claims_table(content)
         elif name == "search":
             assert table == search_table(content)
+        elif name == "peers-seconds":
+            assert table == peers_seconds.table(content["rows"])
+            assert "+" not in content["commit"]
         elif name in ("benchmarks", "predict", "low-rank-scale"):  # theirs are not made by kreps
             assert "+" not in (content["facts"] if name == "benchmarks" else content)["commit"]
         else:
