@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -367,14 +368,13 @@ def test_far_from_the_data_the_state_stays(data: Transitions, features: FloatArr
 def test_a_sample_without_neighbours_keeps_a_share_of_its_change() -> None:
     data = some_transitions(np.random.default_rng(9), far=50.0)
     steps = len(data) // 3
-    alone = Transitions(
-        data.points,
-        data.state[: 2 * steps + 1],
-        data.successor[: 2 * steps + 1],
-        data.start,
-        data.actions[: 2 * steps + 1],
-        data.rewards[: 2 * steps + 1],
-        data.terminated[: 2 * steps + 1],
+    kept = 2 * steps + 1
+    alone = replace(
+        data,
+        **{
+            name: getattr(data, name)[:kept]
+            for name in ("state", "successor", "rollout", "actions", "rewards", "terminated")
+        },
     )
     features = np.random.default_rng(10).normal(size=(len(data.points), 4))
     own, after = features[alone.state[-1]], features[alone.successor[-1]]
@@ -399,15 +399,7 @@ def test_the_sample_model_does_not_depend_on_the_origin(
 def test_after_a_real_end_the_change_leads_to_the_start_states(
     data: Transitions, features: FloatArray
 ) -> None:
-    ended = Transitions(
-        data.points,
-        data.state,
-        data.successor,
-        data.start,
-        data.actions,
-        data.rewards,
-        np.arange(len(data)) % 10 == 9,
-    )
+    ended = replace(data, terminated=np.arange(len(data)) % 10 == 9)
     found = expected(ended, features, embedding_of(ended, 1e-10), "change")
     starts = np.broadcast_to(features[data.start].mean(axis=0), (3, features.shape[1]))
     np.testing.assert_allclose(found[ended.terminated], starts, atol=1e-5)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import kreps
+from kreps.algorithms.imagined_step import Outlook
 from kreps.algorithms.optimism import HIGHEST, KEPT, LEAST, Optimism, known_distance, optimism_of
 from kreps.data import Rollout, TaskSpec, Transitions
 from kreps.kernels import Kernel
@@ -48,13 +49,53 @@ def test_nearly_all_samples_have_one_of_another_rollout_within_the_known_distanc
     assert np.mean(np.array(nearest) <= found) == pytest.approx(0.9, abs=0.03)
 
 
-def test_samples_drawn_one_by_one_are_each_on_their_own() -> None:
-    data = Transitions.of(rollouts(40))
-    drawn = data.rows(np.arange(0, len(data), 5))
+def test_samples_that_are_drawn_keep_their_rollouts() -> None:
+    made = rollouts(40)
+    whole = Transitions.of(made)
+    chosen = np.arange(0, len(whole), 3)
+    drawn = whole.rows(chosen)
     likeness = KERNEL.gram(drawn.states, drawn.states)
-    np.fill_diagonal(likeness, 0.0)
+    likeness[whole.rollout[chosen, None] == whole.rollout[chosen]] = 0.0
     wanted = -np.log(np.quantile(likeness.max(axis=1), 0.1))
     assert known_distance(simulator(drawn)) == pytest.approx(wanted, rel=1e-12)
+    # the same roll-outs, drawn from chunk by chunk
+    first = Transitions.of(made[:20])
+    chunks = first, Transitions.of(made[20:])
+    parts = [
+        chunk.rows(chosen[(chosen >= i) & (chosen < i + len(chunk))] - i)
+        for chunk, i in zip(chunks, (0, len(first)), strict=True)
+    ]
+    assert all(len(part) for part in parts)
+    assert known_distance(simulator(Transitions.joined(parts))) == pytest.approx(wanted, rel=1e-12)
+    assert known_distance(simulator(Transitions.joined(chunks))) == known_distance(simulator(whole))
+
+
+def test_in_panels_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = simulator(Transitions.of(rollouts(9)))
+    whole = known_distance(data)
+    monkeypatch.setattr("kreps.algorithms.optimism.PANEL", 7)
+    assert known_distance(data) == pytest.approx(whole, rel=1e-9)
+
+
+def test_where_an_action_leads_is_hoped_for_but_not_beyond_a_real_end() -> None:
+    alike, ends = np.array([1.0, 0.0, 0.0, 0.0]), np.array([[0.0], [0.0], [1.0], [0.25]])
+    inputs = np.ones((4, 3))
+    process = SimpleNamespace(
+        dynamics=SimpleNamespace(predicted=lambda given: (given[:, :2] + 1.0, ends)),
+        nearest=lambda states: (None, np.where((states == 2.0).all(axis=1), alike, np.nan)),
+    )
+    parts: Any = dict.fromkeys(("states", "features", "features_at", "restart", "expect"))
+    outlook = Outlook(
+        **parts,
+        rewards=np.array([-3.0, 0.0]),
+        reward=lambda given: np.zeros((len(given), 1)),
+        simulator=process,  # type: ignore[arg-type]
+        optimism=Optimism(2.0, 0.0, 0.5),
+    )
+    np.testing.assert_allclose(outlook.rewards_of(inputs), -1.5)
+    np.testing.assert_allclose(outlook.hoped_rewards_of(inputs), [-1.5, 1.5, -1.5, 0.75])
+    for blind in (replace(outlook, simulator=None), replace(outlook, optimism=None)):
+        np.testing.assert_array_equal(blind.hoped_rewards_of(inputs), outlook.rewards_of(inputs))
 
 
 def test_one_rollout_says_nothing_of_what_is_known() -> None:
@@ -119,4 +160,4 @@ def visited_height(optimism: float) -> float:
 def test_an_optimist_goes_where_it_has_not_been() -> None:
     # white noise showed nothing of the height, and what was learnt of that holds the lean
     assert visited_height(0.0) > 1.6
-    assert visited_height(3.0) < 1.4
+    assert visited_height(kreps.Settings().optimism) < 1.4

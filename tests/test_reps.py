@@ -412,10 +412,12 @@ def test_a_single_distinct_state_is_served(recipe: str) -> None:
 @pytest.mark.parametrize("recipe", ["default", "observed", "paper"])
 def test_a_single_distinct_action_is_served(recipe: str) -> None:
     same = [replace(r, actions=np.full_like(r.actions, 0.5)) for r in collect()]
-    settings = replace(settings_of(recipe), optimism=0.0)  # no other action is hoped for
-    state, info = run(same, settings)
-    assert_bounded(info, settings)
+    hopeful = settings_of(recipe)
+    state, info = run(same, hopeful)
+    assert_bounded(info, hopeful)
     assert_usable(state)
+    settings = replace(hopeful, optimism=0.0)  # no other action is hoped for
+    state, info = run(same, settings)
     assert state.policy is not None
     if settings.imagined:
         weights = state.policy.weights / state.policy.weights.sum()

@@ -220,6 +220,7 @@ class Transitions:
         points: (n + R, ds) all states of R roll-outs in order: the set S~ of Eq. 3.
         state, successor: (n,) rows of s_i and of s'_i.
         start: (R,) rows of the start states.
+        rollout: (n,) which of the R roll-outs each step is of.
         actions: (n, da) commanded.
         rewards: (n,).
         terminated: (n,) whether step i really ended the task.
@@ -229,6 +230,7 @@ class Transitions:
     state: IntArray
     successor: IntArray
     start: IntArray
+    rollout: IntArray
     actions: FloatArray
     rewards: FloatArray
     terminated: BoolArray
@@ -262,11 +264,12 @@ class Transitions:
     ) -> Transitions:
         """R roll-outs laid end to end in arrays: (n + R, ds), (n, da), (n,), (R,) and (R,)."""
         ends = np.cumsum(lengths)
-        state = np.arange(len(rewards)) + np.repeat(np.arange(len(lengths)), lengths)
+        rollout = np.repeat(np.arange(len(lengths)), lengths)
+        state = np.arange(len(rewards)) + rollout
         terminated = np.zeros(len(rewards), dtype=bool)
         terminated[ends - 1] = ended
         start = ends - lengths + np.arange(len(lengths))
-        return cls(points, state, state + 1, start, actions, rewards, terminated)
+        return cls(points, state, state + 1, start, rollout, actions, rewards, terminated)
 
     @classmethod
     def joined(cls, parts: Sequence[Transitions]) -> Transitions:
@@ -274,11 +277,13 @@ class Transitions:
         if len(parts) == 1:
             return parts[0]
         before = np.cumsum([0, *(len(part.points) for part in parts[:-1])])
+        earlier = np.cumsum([0, *(len(part.start) for part in parts[:-1])])
         return cls(
             points=np.concatenate([part.points for part in parts]),
             state=np.concatenate([p.state + b for p, b in zip(parts, before, strict=True)]),
             successor=np.concatenate([p.successor + b for p, b in zip(parts, before, strict=True)]),
             start=np.concatenate([p.start + b for p, b in zip(parts, before, strict=True)]),
+            rollout=np.concatenate([p.rollout + e for p, e in zip(parts, earlier, strict=True)]),
             actions=np.concatenate([part.actions for part in parts]),
             rewards=np.concatenate([part.rewards for part in parts]),
             terminated=np.concatenate([part.terminated for part in parts]),
@@ -289,13 +294,14 @@ class Transitions:
         if len(chosen) == len(self):
             return self
         k = len(chosen)
-        of = np.unique(np.searchsorted(self.start, self.state[chosen], side="right") - 1)
+        of, rollout = np.unique(self.rollout[chosen], return_inverse=True)
         named = (self.state[chosen], self.successor[chosen], self.start[of])
         return Transitions(
             points=self.points[np.concatenate(named)],
             state=np.arange(k),
             successor=k + np.arange(k),
             start=2 * k + np.arange(len(of)),
+            rollout=rollout,
             actions=self.actions[chosen],
             rewards=self.rewards[chosen],
             terminated=self.terminated[chosen],

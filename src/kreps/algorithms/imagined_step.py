@@ -68,12 +68,16 @@ class Outlook:
         return np.clip(said, self.rewards.min(), self.rewards.max())
 
     def hoped_rewards_of(self, inputs: FloatArray) -> FloatArray:
-        """The same (m,), and more for actions that lead to where nothing is known."""
+        """The same (m,), and more for actions that lead to where nothing is known.
+
+        What follows a real end is known: a start state.
+        """
         rewards = self.rewards_of(inputs)
         if self.simulator is None or self.optimism is None:
             return rewards
-        _, likeness = self.simulator.nearest(self.simulator.dynamics.predicted(inputs)[0])
-        return rewards + self.optimism.bonus(rewards, likeness)
+        successors, ends = self.simulator.dynamics.predicted(inputs)
+        _, likeness = self.simulator.nearest(successors)
+        return rewards + (1.0 - ends[:, 0]) * self.optimism.bonus(rewards, likeness)
 
 
 @dataclass(frozen=True)

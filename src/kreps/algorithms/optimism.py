@@ -33,6 +33,9 @@ KNOWN = 0.9
 ROUNDING = 1e-12
 """Least distance that is known: states that are equal but for rounding are."""
 
+PANEL = 3_000
+"""Samples that all are compared with at once, so that memory grows like their number."""
+
 _TINY = float(np.finfo(np.float64).tiny)
 
 
@@ -51,7 +54,12 @@ class Optimism:
     edge: float
 
     def bonus(self, rewards: FloatArray, likeness: FloatArray) -> FloatArray:
-        """For expected rewards, by the likeness of states to the nearest sample; any one shape."""
+        """What is added to each expected reward, standardised, of one shape, such as (m,).
+
+        Args:
+            rewards: expected, standardised.
+            likeness: of the states to the nearest sample, up to 1; of the same shape.
+        """
         far = -np.log(np.maximum(likeness, _TINY))
         unknown = -np.expm1(-np.maximum(far - self.edge, 0.0) / self.edge)
         return self.strength * unknown * np.maximum(self.best - rewards, 0.0)
@@ -60,7 +68,14 @@ class Optimism:
 def optimism_of(
     simulator: Simulator | None, rewards: FloatArray, updates: int, settings: Settings
 ) -> Optimism | None:
-    """Of an update after so many, from rewards (n,), standardised; None where there is none."""
+    """The optimism of one update; None where there is none.
+
+    Args:
+        simulator: of its samples; None if nothing can be simulated.
+        rewards: (n,) of its samples, standardised.
+        updates: that were made before.
+        settings: ``optimism`` of the first update.
+    """
     strength = settings.optimism * KEPT**updates
     if simulator is None or strength < LEAST:
         return None
@@ -74,16 +89,16 @@ def optimism_of(
 def known_distance(simulator: Simulator) -> float | None:
     """Half the squared distance, in lengthscales, that `KNOWN` of the samples have another within.
 
-    Those of its own roll-out do not count, as they are near in any case.  None if there is no
-    other roll-out.
+    Those of its own roll-out do not count, as they are near in any case.  None if all samples are
+    of one roll-out.
     """
-    data = simulator.data
-    of = np.searchsorted(data.start, data.state, side="right")
-    if not of.any():  # drawn one by one from many roll-outs, hardly two from the same
-        of = np.arange(len(data))
+    states, of = simulator.data.states, simulator.data.rollout
     if of[0] == of[-1]:
         return None
-    likeness = simulator.kernel.gram(data.states, data.states)
-    likeness[of[:, None] == of] = 0.0
-    nearest = likeness.max(axis=1)
-    return max(-float(np.log(max(np.quantile(nearest, 1.0 - KNOWN), _TINY))), ROUNDING)
+    nearest = []
+    for i in range(0, len(states), PANEL):
+        likeness = simulator.kernel.gram(states[i : i + PANEL], states)
+        likeness[of[i : i + PANEL, None] == of] = 0.0
+        nearest.append(likeness.max(axis=1))
+    likeness_of_edge = np.quantile(np.concatenate(nearest), 1.0 - KNOWN)
+    return max(-float(np.log(max(likeness_of_edge, _TINY))), ROUNDING)
