@@ -496,18 +496,22 @@ def positive(text: str) -> int:
     return int(text)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_tasks(parser: argparse.ArgumentParser, default: list[str]) -> None:
     parser.add_argument(
         "--tasks",
         nargs="+",
         choices=TASKS,
-        default=["swing-up"],
+        default=default,
         metavar="TASK",
-        help=f"of {', '.join(TASKS)} (default: swing-up)",
+        help=f"of {', '.join(TASKS)} (default: {' '.join(default)})",
     )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    add_tasks(parser, default=["swing-up"])
     parser.add_argument(
         "--learners", nargs="+", choices=LEARNERS, default=LEARNERS, help="default: both"
     )

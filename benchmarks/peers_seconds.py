@@ -14,14 +14,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from itertools import groupby
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from peers import MARKS, TASKS, Cell, Stopwatch, model_of, positive, seeds_of, write
+from peers import MARKS, TASKS, Cell, Stopwatch, add_tasks, model_of, positive, seeds_of, write
 
 import kreps
 from kreps.experiments.runner import commit
@@ -58,7 +57,7 @@ def seconds_of_sac(task: str, seed: int, steps: int) -> tuple[float, float]:
             return now
 
 
-def row(learner: str, task: str, seed: int, steps: int) -> dict[str, Any]:
+def measured(learner: str, task: str, seed: int, steps: int) -> dict[str, Any]:
     """Measured here, in a process of its own."""
     measure = {"kreps": seconds_of_kreps, "sac": seconds_of_sac}[learner]
     cpu, wall = measure(task, seed, steps)
@@ -74,8 +73,8 @@ def row(learner: str, task: str, seed: int, steps: int) -> dict[str, Any]:
 def table(rows: Sequence[dict[str, Any]]) -> str:
     """Means over seeds as Markdown, a line for each task."""
     lines = []
-    for task, of_task in groupby(sorted(rows, key=lambda r: [*TASKS].index(r["task"])), by_task):
-        found = list(of_task)
+    for task in dict.fromkeys(row["task"] for row in rows):
+        found = [row for row in rows if row["task"] == task]
         cpu, wall = (
             {
                 learner: float(np.mean([r[name] for r in found if r["learner"] == learner]))
@@ -95,22 +94,11 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return markdown(head, lines)
 
 
-def by_task(measured: dict[str, Any]) -> str:
-    return str(measured["task"])
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "--tasks",
-        nargs="+",
-        choices=TASKS,
-        default=list(TASKS),
-        help="default: all",
-        metavar="TASK",
-    )
+    add_tasks(parser, default=[*TASKS])
     parser.add_argument("--seeds", type=seeds_of, default=range(1), help="such as 0 or 0-2")
     parser.add_argument("--steps", type=positive, default=MARKS[-1], help=f"default: {MARKS[-1]}")
     parser.add_argument("--out", type=Path, default=Path("results"), help="default: results")
@@ -120,7 +108,7 @@ def main() -> None:
         for seed in options.seeds:
             for learner in LEARNERS:
                 with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
-                    rows.append(alone.submit(row, learner, task, seed, options.steps).result())
+                    rows.append(alone.submit(measured, learner, task, seed, options.steps).result())
                 print(rows[-1], flush=True)
     about = {
         "command": f"python benchmarks/peers_seconds.py --seeds {options.seeds[0]}-"

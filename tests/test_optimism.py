@@ -73,7 +73,7 @@ def test_samples_that_are_drawn_keep_their_rollouts() -> None:
 def test_in_panels_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     data = simulator(Transitions.of(rollouts(9)))
     whole = known_distance(data)
-    monkeypatch.setattr("kreps.algorithms.optimism.PANEL", 7)
+    monkeypatch.setattr("kreps.algorithms.optimism.AT_ONCE", 7)
     assert known_distance(data) == pytest.approx(whole, rel=1e-9)
 
 

@@ -19,8 +19,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from kreps.algorithms.imagined_rollouts import average_reward
+from kreps.algorithms.imagined_rollouts import Followed, average_reward
 from kreps.algorithms.imagined_step import Outlook
+from kreps.arrays import FloatArray
 from kreps.policies import StochasticPolicy
 from kreps.settings import Settings
 
@@ -53,14 +54,14 @@ def refuses(
         process.follow(policy, outlook.rewards_of, count, deepcopy(rng)) for policy in (new, before)
     )
     typical = max(float(np.median(followed_before.likeness)), np.finfo(np.float64).tiny)
-    earned, earned_before = (
-        average_reward(
-            each.feared_rewards(outlook.rewards.min(), typical)
-            if outlook.optimism is None
-            else each.rewards + outlook.optimism.bonus(each.rewards, each.likeness),
-            process.restart_probability,
-        )
-        for each in (followed, followed_before)
-    )
-    gain = earned - earned_before
+
+    def earned(each: Followed) -> FloatArray:
+        hope = outlook.optimism
+        if hope is None:
+            rewards = each.feared_rewards(outlook.rewards.min(), typical)
+        else:
+            rewards = each.rewards + hope.bonus(each.rewards, each.likeness)
+        return average_reward(rewards, process.restart_probability)
+
+    gain = earned(followed) - earned(followed_before)
     return bool(gain.mean() < -gain.std(ddof=1) / np.sqrt(count))

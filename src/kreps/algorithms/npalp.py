@@ -81,7 +81,7 @@ def update(
     clock.lap("distances")
     rewards, unit = standardise(data.rewards)
     # a step that really ends the task leads to a start state, here to that of its own roll-out
-    starts = data.start[np.searchsorted(data.start, data.state, side="right") - 1]
+    starts = data.start[data.rollout]
     successor = np.where(data.terminated, starts, data.successor)
     bounds, improvements, residual = sample_bounds(
         rewards,

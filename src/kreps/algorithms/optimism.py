@@ -33,7 +33,7 @@ KNOWN = 0.9
 ROUNDING = 1e-12
 """Least distance that is known: states that are equal but for rounding are."""
 
-PANEL = 3_000
+AT_ONCE = 3_000
 """Samples that all are compared with at once, so that memory grows like their number."""
 
 _TINY = float(np.finfo(np.float64).tiny)
@@ -96,9 +96,9 @@ def known_distance(simulator: Simulator) -> float | None:
     if of[0] == of[-1]:
         return None
     nearest = []
-    for i in range(0, len(states), PANEL):
-        likeness = simulator.kernel.gram(states[i : i + PANEL], states)
-        likeness[of[i : i + PANEL, None] == of] = 0.0
+    for i in range(0, len(states), AT_ONCE):
+        likeness = simulator.kernel.gram(states[i : i + AT_ONCE], states)
+        likeness[of[i : i + AT_ONCE, None] == of] = 0.0
         nearest.append(likeness.max(axis=1))
     likeness_of_edge = np.quantile(np.concatenate(nearest), 1.0 - KNOWN)
     return max(-float(np.log(max(likeness_of_edge, _TINY))), ROUNDING)
