@@ -370,15 +370,17 @@ def test_each_state_has_its_own_features_and_the_noise_of_its_sample(
 
 
 def test_the_support_of_an_exact_policy_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
-    still = [replace(r, rewards=np.ones(len(r))) for r in turns()]
-    many = kreps.KREPS(TASK, approximation="exact")
-    many.update(still)
+    def learnt() -> kreps.KREPS:
+        learner = kreps.KREPS(TASK, approximation="exact", kl_bound=0.01)  # all weigh alike
+        learner.update(turns())
+        return learner
+
+    many = learnt()
     count = len(many.policy.process.states)
     assert count > 120  # more targets than samples
     for module in (reps, policies):
         monkeypatch.setattr(module, "MAX_SUPPORT", 120)
-    few = kreps.KREPS(TASK, approximation="exact")
-    few.update(still)
+    few = learnt()
     assert len(few.policy.process.states) == 120
     of_all = {s.tobytes() for s in many.policy.process.states}
     assert {s.tobytes() for s in few.policy.process.states} <= of_all
@@ -561,7 +563,7 @@ def test_a_policy_that_leaves_what_is_known_is_refused() -> None:
 
 
 def test_an_optimist_is_judged_by_what_it_hopes_for() -> None:
-    hope = Optimism(strength=1.0, best=100.0, edge=0.1)
+    hope = Optimism(hoped=100.0, gain=0.0, edge=0.1)
     assert judged(Risky(0.5, likeness=0.5), Risky(1.0), optimism=hope) is False
     assert judged(Risky(0.5), Risky(1.0), optimism=hope) is True  # there it is known
 

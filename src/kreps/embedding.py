@@ -15,7 +15,7 @@ import numpy as np
 from kreps.arrays import Array, FloatArray, as_numpy
 from kreps.kernels import Kernel, gaussian_gram
 from kreps.linalg import Cholesky, cholesky, solve_lower, with_diagonal
-from kreps.value import Basis
+from kreps.value import Basis, RKHSBasis
 
 ROWS = 2048
 """Inputs predicted at once: their Gram matrix with all samples would be the largest array."""
@@ -102,6 +102,50 @@ class KernelEmbedding:
         """In closed form, of targets (n, r): ``[C^-1 F']_i / [C^-1]_ii``."""
         inverse = self.factor.inverse()
         return LeaveOneOut(targets, inverse @ targets / np.diagonal(inverse)[:, None])
+
+
+NEGLIGIBLE = 1e-4
+"""Part of its regulariser by which a regression may miss the kernel of a sample with itself."""
+
+
+@dataclass(frozen=True)
+class PivotedEmbedding:
+    """`KernelEmbedding` in features of a few pivots, which leave next to nothing of its kernel out.
+
+    What is left out of ``K_sa`` would add less than `NEGLIGIBLE` lambda to each sample's lambda, so
+    nothing that the regulariser lets through is lost, at a cost of n r^2 instead of n^3.
+
+    Attributes:
+        basis: r features psi of states and applied actions.
+        features: (n, r) those of the samples, Psi.
+        regulariser: lambda.
+        factor: Cholesky factor of ``Psi'Psi + lambda I``.
+    """
+
+    basis: RKHSBasis
+    features: FloatArray
+    regulariser: float
+    factor: Cholesky
+
+    @classmethod
+    def fit(cls, kernel: Kernel, inputs: FloatArray, regulariser: float) -> PivotedEmbedding | None:
+        """None where half as many pivots as samples do not suffice, and nothing would be saved."""
+        tolerance = NEGLIGIBLE * regulariser
+        basis, features = RKHSBasis.fit(
+            kernel, inputs, tolerance=tolerance, max_rank=len(inputs) // 2
+        )
+        if basis.residual > tolerance:
+            return None
+        factor = cholesky(with_diagonal(features.T @ features, regulariser))
+        return cls(basis, features, regulariser, factor)
+
+    def predictor(self, targets: FloatArray) -> Callable[[FloatArray], FloatArray]:
+        """What is expected of targets (n, r) as a function of inputs (m, ds + da)."""
+        return self.basis.function(self.factor.solve(self.features.T @ targets))
+
+    def leave_one_out(self, targets: FloatArray) -> LeaveOneOut:
+        """In closed form, of targets (n, r)."""
+        return FeatureRegression.leave_one_out(self.features, targets, self.regulariser)
 
 
 @dataclass(frozen=True)

@@ -146,8 +146,16 @@ def factor_distances(factors: tuple[Factor, ...], x: FloatArray) -> FloatArray:
     return np.stack([squared_distances(factor, x) for factor in factors])
 
 
+TOLERANCE = 1e-3
+"""Relative gain of an iteration that ends a fit: less is not told apart by some hundred samples."""
+
+
 def minimise(
-    loss: EmbeddingLoss | PolicyLoss, prior: Prior, start: FloatArray, max_iterations: int = 30
+    loss: EmbeddingLoss | PolicyLoss,
+    prior: Prior,
+    start: FloatArray,
+    max_iterations: int = 30,
+    tolerance: float = TOLERANCE,
 ) -> FloatArray:
     """Parameters of least loss plus prior within the prior's box, from ``start`` (L-BFGS-B)."""
 
@@ -165,6 +173,6 @@ def minimise(
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(prior.low, prior.high, strict=True)),
-        options={"maxiter": max_iterations, "ftol": 1e-5},
+        options={"maxiter": max_iterations, "ftol": tolerance},
     )
     return np.asarray(found.x, dtype=np.float64)

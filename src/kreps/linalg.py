@@ -41,9 +41,11 @@ class Cholesky:
 
     def inverse(self) -> FloatArray:
         """``A^-1``, (n, n) and symmetric."""
-        half, _ = lapack.dpotri(self.lower, lower=1)
-        half = np.tril(half)
-        return half + np.tril(half, -1).T
+        half, _ = lapack.dpotri(self.lower, lower=1)  # above the diagonal as ``lower``: zero
+        diagonal = np.diagonal(half).copy()
+        whole = half + half.T
+        np.fill_diagonal(whole, diagonal)
+        return whole
 
 
 def cholesky(a: Array) -> Cholesky:

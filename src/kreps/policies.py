@@ -11,15 +11,8 @@ import numpy as np
 from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
 from kreps.errors import ConfigurationError
-from kreps.kernels import Kernel, pivots_of
-from kreps.linalg import (
-    Cholesky,
-    cholesky,
-    inverse_lower,
-    qr_factor,
-    solve_lower,
-    solve_lower_transposed,
-)
+from kreps.kernels import Kernel
+from kreps.linalg import Cholesky, cholesky, inverse_lower
 from kreps.sparse_gp import PolicySums, SparseGP
 from kreps.value import RKHSBasis
 
@@ -68,9 +61,10 @@ MAX_SUPPORT = 6_000
 """Most support points of an exact policy: it costs their square in memory, their cube in time."""
 
 PIVOT_TOLERANCE = 1e-12
-"""Largest squared residual of a support point's kernel function outside the span of the pivots'.
+"""Of a policy that is to have few centres: largest squared residual that needs no more of them."""
 
-The scaled mean is off by at most ``sf2 sqrt(1e-12) sum |alpha|``: about 1e-5 on learnt policies."""
+NEGLIGIBLE = 1e-4
+"""Part of its noise by which a policy may miss the prior variance of a support point."""
 
 
 @dataclass(frozen=True)
@@ -124,31 +118,35 @@ class CostSensitiveGP:
 
     @cached_property
     def predictor(self) -> SparseGP:
-        """The same process, up to `PIVOT_TOLERANCE`, as the control loop evaluates it.
+        """The same process as the control loop evaluates it, with few centres where these suffice.
 
-        The kernel of any state with the m support points is nearly a linear function of its kernel
-        with r of them (the pivots of a Cholesky factorisation), and r << m for smooth kernels.
-        So both moments become products with (r, r) matrices computed once: a control cycle costs
-        r^2 instead of m^2.
+        Kernels of smooth policies are nearly linear functions of each other.  The pivots r << m of
+        a Cholesky factorisation are chosen until what they leave of any support point's kernel is
+        below `NEGLIGIBLE` times its least noise, so that C is as it was up to so small a part
+        of its noise.  A control cycle then costs r^2 instead of m^2, and to fit it m r^2 instead of
+        m^3.  Where half of the support points do not suffice, all are centres.
         """
-        kernel, states = self.kernel, self.states
-        chosen = pivots_of(kernel, states, tolerance=PIVOT_TOLERANCE, max_rank=len(states) // 2)
-        if chosen.residual > PIVOT_TOLERANCE:  # not so smooth: all support points are pivots
-            centres = states
-            mean_weights = self.signal * self.alpha
-            explained = self.signal * inverse_lower(self.factor.lower)
-        else:
-            # k(states, s) = columns phi(s) with phi(s) = lower^-1 k(pivots, s)
-            centres = states[chosen.pivots]
-            lower = np.tril(chosen.columns[chosen.pivots])
-            columns = self.signal * chosen.columns
-            mean_weights = solve_lower_transposed(lower, columns.T @ self.alpha)
-            # k' C^-1 k = |L^-1 columns phi|^2 = |R phi|^2 with R from the QR of L^-1 columns
-            r = qr_factor(solve_lower(self.factor.lower, columns))
-            explained = np.ascontiguousarray(solve_lower_transposed(lower, r.T).T)
-        return SparseGP(
-            self.task, kernel, centres, mean_weights, explained, self.signal, self.noise
+        tolerance = NEGLIGIBLE * self.noise / (self.signal * float(self.weights.max()))
+        basis, features = RKHSBasis.fit(
+            self.kernel, self.states, tolerance=tolerance, max_rank=len(self.states) // 2
         )
+        if basis.residual <= tolerance:
+            sums = PolicySums.of(features, self.weights, self.targets)
+            return SparseGP.fit(self.task, basis, sums, self.signal, self.noise)
+        return SparseGP(
+            self.task,
+            self.kernel,
+            self.states,
+            self.signal * self.alpha,
+            self.signal * inverse_lower(self.factor.lower),
+            self.signal,
+            self.noise,
+        )
+
+    @property
+    def jitter(self) -> float:
+        """What the factorisation of C needed, if it was needed itself."""
+        return self.factor.jitter if len(self.predictor.states) == len(self.states) else 0.0
 
     def mean(self, states: FloatArray) -> FloatArray:
         """Mean action (m, da) at states (m, ds), in the task's units, not clipped."""

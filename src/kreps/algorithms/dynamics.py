@@ -24,10 +24,10 @@ from functools import cached_property
 
 import numpy as np
 
-from kreps.algorithms.transition_model import fit_embedding, state_actions
+from kreps.algorithms.transition_model import fit_regression, state_actions
 from kreps.arrays import Array, FloatArray, IntArray, columns, like
 from kreps.data import TaskSpec, Transitions
-from kreps.embedding import ROWS, KernelEmbedding, LeaveOneOut
+from kreps.embedding import ROWS, LeaveOneOut
 from kreps.kernels import Kernel
 from kreps.value import Basis
 
@@ -217,13 +217,13 @@ def fit_dynamics(
     task: TaskSpec,
     start: FloatArray | None,
     rng: np.random.Generator,
-) -> tuple[Dynamics, KernelEmbedding, FloatArray]:
-    """The regression of n transitions, the embedding that makes it, and its log parameters.
+) -> tuple[Dynamics, FloatArray, float]:
+    """The regression of n transitions, its log parameters, and the jitter of its factorisation.
 
-    Arguments are those of `kreps.algorithms.transition_model.fit_embedding`, but for the targets.
+    Arguments are those of `kreps.algorithms.transition_model.fit_regression`, but for the targets.
     """
     motion = Motion.of(data, task)
     targets = motion.targets(data, task)
-    model, x = fit_embedding(data, targets, state_kernel, task, start, rng)
+    model, x = fit_regression(data, targets, state_kernel, task, start, rng)
     missed = model.leave_one_out(targets).errors
-    return Dynamics(motion, model.predictor(targets), missed), model, x
+    return Dynamics(motion, model.predictor(targets), missed), x, model.factor.jitter

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kreps.algorithms.boldness import is_judged, least_temperature, widening
+from kreps.algorithms.dynamics import after_ends
 from kreps.algorithms.imagined_rollouts import Simulator
 from kreps.algorithms.optimism import Optimism
 from kreps.algorithms.transition_model import feature_differences
@@ -67,17 +68,16 @@ class Outlook:
         said = self.rewards.mean() + self.reward(inputs)[:, 0]
         return np.clip(said, self.rewards.min(), self.rewards.max())
 
-    def hoped_rewards_of(self, inputs: FloatArray) -> FloatArray:
-        """The same (m,), and more for actions that lead to where nothing is known.
+    def unknown_of(self, inputs: FloatArray) -> FloatArray:
+        """How far actions lead to the unknown, 0 to 1: (m,), of inputs likewise.
 
         What follows a real end is known: a start state.
         """
-        rewards = self.rewards_of(inputs)
         if self.simulator is None or self.optimism is None:
-            return rewards
+            return np.zeros(len(inputs))
         successors, ends = self.simulator.dynamics.predicted(inputs)
         _, likeness = self.simulator.nearest(successors)
-        return rewards + (1.0 - ends[:, 0]) * self.optimism.bonus(rewards, likeness)
+        return (1.0 - ends[:, 0]) * self.optimism.unknown(likeness)
 
 
 @dataclass(frozen=True)
@@ -138,15 +138,16 @@ def imagine(
     noise = widening(judged, settings) * rng.standard_normal((count, task.action_size))
     actions = policy.act(states[of], noise)
     inputs = np.concatenate([states[of], task.scaled(task.clip(actions))], axis=1)
-    rewards = outlook.hoped_rewards_of(inputs)
+    rewards = outlook.rewards_of(inputs)
+    expected = outlook.expect(rows[of], inputs)
+    p = settings.restart_probability
+    if outlook.optimism is not None:
+        unknown = outlook.unknown_of(inputs)
+        rewards = rewards + unknown * outlook.optimism.surplus(p)
+        expected = after_ends(expected, unknown[:, None], outlook.restart)
     problem = DualProblem(
         rewards=rewards - rewards.max(),
-        differences=feature_differences(
-            features[of],
-            outlook.expect(rows[of], inputs),
-            outlook.restart,
-            settings.restart_probability,
-        ),
+        differences=feature_differences(features[of], expected, outlook.restart, p),
         kl_bound=settings.kl_bound,
         ridge=ridge / count,
         eta_floor=least_temperature(judged, settings),

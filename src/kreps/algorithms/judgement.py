@@ -60,7 +60,7 @@ def refuses(
         if hope is None:
             rewards = each.feared_rewards(outlook.rewards.min(), typical)
         else:
-            rewards = each.rewards + hope.bonus(each.rewards, each.likeness)
+            rewards = hope.followed(each.rewards, each.likeness)
         return average_reward(rewards, process.restart_probability)
 
     gain = earned(followed) - earned(followed_before)

@@ -40,6 +40,7 @@ from kreps.algorithms.reps import (
     PolicySamples,
     UpdateInfo,
     drawn_noise,
+    imagines,
     policy_hyperparameters,
     share_clipped,
     simulator_of,
@@ -47,6 +48,7 @@ from kreps.algorithms.reps import (
 )
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
+    REWARD_TOLERANCE,
     embedding_hyperparameters,
     feature_differences,
     restart_features,
@@ -195,11 +197,12 @@ def update(
 
     # the same once more, for other actions in the states of the sample and where they lead
     reward_start, refused = state.reward_start, None
-    if settings.imagined and expectation.of_actions is not None and seen is not None:
+    wanted = seen is not None and imagines(settings, window, task)
+    if wanted and expectation.of_actions is not None:
         inputs = state_actions(sample, task)
         targets = (rewards[sampled] - rewards[sampled].mean())[:, None]
         reward_kernel, regulariser, reward_start = embedding_hyperparameters(
-            inputs, targets, kernel, task, reward_start, rng
+            inputs, targets, kernel, task, reward_start, rng, REWARD_TOLERANCE
         )
         embedded = choose_basis(reward_kernel, inputs, settings, settings.rank, rng)
         bases.append(embedded)
@@ -207,6 +210,7 @@ def update(
         reward_sums = RegressionSums.of(embedded.features(inputs), targets)
         regression = FeatureRegression.fit(embedded, reward_sums, regulariser * len(sample) / n)
         jitters.append(regression.jitter)
+        share = dual.weights[sampled] / dual.weights[sampled].sum()
         outlook = Outlook(
             states=sample.states,
             features=own,
@@ -216,9 +220,8 @@ def update(
             expect=expectation.of_actions,
             reward=regression.mean,
             simulator=simulator,
-            optimism=optimism_of(simulator, rewards[sampled], state.iteration, settings),
+            optimism=optimism_of(simulator, rewards[sampled], share, state.iteration, settings),
         )
-        share = dual.weights[sampled] / dual.weights[sampled].sum()
         imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
         # V is nearly known, the temperature is to be found anew: it may have to rise
         dual = solve_dual(imagined.problem, start=(1.0, dual.theta))

@@ -1,10 +1,13 @@
 """What is not known is thought to be good: the optimism of R-max (Brafman and Tennenholtz 2002).
 
 A policy that holds the best state it has seen makes no other data, and what it has never seen is
-not imagined either: a local optimum is for ever.  So in the model what no sample is like has the
-best reward that is known, and more, until somebody has been there.  What is like the samples is
-told by the samples: nearly all of them have one of another roll-out within a certain distance, and
-what is farther off is unknown, the farther the more.
+not imagined either: a local optimum is for ever.  So in the model whoever comes to what no sample
+is like earns a good reward there, step after step, until the restart; which is worth a detour as no
+reward of one step would be.  V need not know of it: to the update it is an action that earns all of
+that at once, and is followed by the restart.
+
+What is like the samples is told by the samples: nearly all of them have one of another roll-out
+within a certain distance, and what is farther off is unknown, the farther the more.
 """
 
 from __future__ import annotations
@@ -20,7 +23,7 @@ from kreps.settings import Settings
 KEPT = 0.35
 """What is left of the optimism after each update: later, what is not known was passed by."""
 
-LEAST = 0.05
+LEAST = 0.005
 """Less optimism is none."""
 
 HIGHEST = 2.0
@@ -41,38 +44,57 @@ _TINY = float(np.finfo(np.float64).tiny)
 
 @dataclass(frozen=True)
 class Optimism:
-    """What is added to expected rewards where nothing is known.
+    """What is hoped for where nothing is known.
 
     Attributes:
-        strength: share of the way to the best reward that is added at most; it may be above 1.
-        best: reward that is hoped for, standardised.
+        hoped: reward per step that is earned there until a restart, standardised.
+        gain: reward per step that the samples earn as they are weighed, standardised.
         edge: half the squared distance, in lengthscales, up to which a state is known.
     """
 
-    strength: float
-    best: float
+    hoped: float
+    gain: float
     edge: float
 
-    def bonus(self, rewards: FloatArray, likeness: FloatArray) -> FloatArray:
-        """What is added to each expected reward, standardised, of one shape, such as (m,).
+    def unknown(self, likeness: FloatArray) -> FloatArray:
+        """How far states are from being known, 0 to 1.
 
         Args:
-            rewards: expected, standardised.
-            likeness: of the states to the nearest sample, up to 1; of the same shape.
+            likeness: of the states to the nearest sample, up to 1, of any shape, such as (m,).
         """
         far = -np.log(np.maximum(likeness, _TINY))
-        unknown = -np.expm1(-np.maximum(far - self.edge, 0.0) / self.edge)
-        return self.strength * unknown * np.maximum(self.best - rewards, 0.0)
+        return -np.expm1(-np.maximum(far - self.edge, 0.0) / self.edge)
+
+    def surplus(self, restart_probability: float) -> float:
+        """What an action that leads there earns more than the samples on average, in all.
+
+        ``sum_k (1 - p)^k (hoped - gain)`` over the steps from the next one to the restart.
+        """
+        return (1.0 - restart_probability) / restart_probability * (self.hoped - self.gain)
+
+    def followed(self, rewards: FloatArray, likeness: FloatArray) -> FloatArray:
+        """Rewards (steps, count) of roll-outs in the model that find the unknown, if they do.
+
+        Args:
+            rewards, likeness: (steps, count) that the model tells of their states.
+        """
+        known_yet = np.cumprod(1.0 - self.unknown(likeness), axis=0)
+        return self.hoped + known_yet * (rewards - self.hoped)
 
 
 def optimism_of(
-    simulator: Simulator | None, rewards: FloatArray, updates: int, settings: Settings
+    simulator: Simulator | None,
+    rewards: FloatArray,
+    weights: FloatArray,
+    updates: int,
+    settings: Settings,
 ) -> Optimism | None:
     """The optimism of one update; None where there is none.
 
     Args:
         simulator: of its samples; None if nothing can be simulated.
         rewards: (n,) of its samples, standardised.
+        weights: (n,) of the first step.
         updates: that were made before.
         settings: ``optimism`` of the first update.
     """
@@ -82,8 +104,9 @@ def optimism_of(
     edge = known_distance(simulator)
     if edge is None:
         return None
+    gain = float(weights @ rewards)
     best = min(float(rewards.max()), float(rewards.mean()) + HIGHEST * float(rewards.std()))
-    return Optimism(strength, best, edge)
+    return Optimism(gain + strength * max(best - gain, 0.0), gain, edge)
 
 
 def known_distance(simulator: Simulator) -> float | None:

@@ -17,8 +17,10 @@ from kreps.algorithms.judgement import refuses
 from kreps.algorithms.optimism import optimism_of
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
+    REWARD_TOLERANCE,
     feature_differences,
     fit_embedding,
+    fit_regression,
     random_rows,
     restart_features,
     state_kernel,
@@ -35,6 +37,7 @@ from kreps.dual import (
     standardise,
 )
 from kreps.embedding import KernelEmbedding, LeaveOneOut, SampleModel, TransitionModel
+from kreps.exploration import tells_of_states
 from kreps.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel
 from kreps.policies import MAX_SUPPORT, CostSensitiveGP
@@ -185,10 +188,12 @@ def update(
 
     # the same once more, for other actions in these states and where they lead
     reward_start, refused = state.reward_start, None
-    if settings.imagined and expectation.of_actions is not None:
+    if expectation.of_actions is not None and imagines(settings, window, task):
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
         targets = (rewards - rewards.mean())[:, None]
-        regression, reward_start = fit_embedding(data, targets, kernel, task, reward_start, rng)
+        regression, reward_start = fit_regression(
+            data, targets, kernel, task, reward_start, rng, REWARD_TOLERANCE
+        )
         jitters.append(regression.factor.jitter)
         outlook = Outlook(
             states=data.states,
@@ -199,7 +204,7 @@ def update(
             expect=expectation.of_actions,
             reward=regression.predictor(targets),
             simulator=simulator,
-            optimism=optimism_of(simulator, rewards, state.iteration, settings),
+            optimism=optimism_of(simulator, rewards, dual.weights, state.iteration, settings),
         )
         imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
         # V is nearly known, the temperature is to be found anew: it may have to rise
@@ -241,10 +246,18 @@ def update(
         policy_parameters=np.exp(policy_x),
         noise=policy.noise,
         refused=refused,
-        jitter=max(dual.jitter, policy.factor.jitter, *jitters),
+        jitter=max(dual.jitter, policy.jitter, *jitters),
         seconds=clock.seconds,
     )
     return new_state, info
+
+
+def imagines(settings: Settings, window: Window, task: TaskSpec) -> bool:
+    """Whether a second step is wanted: where no reward tells of the states, it has nothing to gain.
+
+    The next roll-outs then explore, whatever is learnt (`OnPolicyLearner.exploring`).
+    """
+    return settings.imagined > 0 and tells_of_states(window.rollouts, task)
 
 
 def value_basis(data: Transitions, kernel: Kernel, settings: Settings) -> tuple[Basis, FloatArray]:
@@ -331,7 +344,7 @@ def expected_successors(
         clock: of the stages.
     """
     if settings.model == "dynamics":
-        dynamics, regression, x = fit_dynamics(data, state_kernel, task, start, rng)
+        dynamics, x, jitter = fit_dynamics(data, state_kernel, task, start, rng)
         clock.lap("embedding fit")
         own, observed = features[data.state], features[data.successor]
         after_end = features[data.start].mean(axis=0)
@@ -339,7 +352,6 @@ def expected_successors(
             data, basis, own, observed, after_end, dynamics, task
         )
         of_actions = partial(dynamics.expected_features, basis, after_end)
-        jitter = regression.factor.jitter
         return Expectation(expected, errors, of_actions, x, jitter, dynamics)
     origin = embedding_origin(data, features, settings)
     successors = successor_features(data, features) - origin

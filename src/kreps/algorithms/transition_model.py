@@ -9,13 +9,17 @@ import numpy as np
 
 from kreps.arrays import FloatArray, IntArray
 from kreps.data import TaskSpec, Transitions
-from kreps.embedding import KernelEmbedding
-from kreps.hyperparameters import EmbeddingLoss, Prior, factor_distances, minimise
+from kreps.embedding import KernelEmbedding, PivotedEmbedding
+from kreps.hyperparameters import TOLERANCE, EmbeddingLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel, SquaredExponential, median_lengthscales
 from kreps.settings import Settings
 
-FIT_SAMPLE = 400
+FIT_SAMPLE = 300
 """Samples on which hyper-parameters are fitted: the cost is cubic, the estimate no better."""
+
+REWARD_TOLERANCE = 1e-5
+"""Of the reward's fit.  Where a goal is seldom reached it is a small part of the error, and a fit
+that ends early has not found it yet."""
 
 
 def random_rows(n: int, rng: np.random.Generator) -> IntArray:
@@ -86,6 +90,7 @@ def embedding_hyperparameters(
     task: TaskSpec,
     start: FloatArray | None,
     rng: np.random.Generator,
+    tolerance: float = TOLERANCE,
 ) -> tuple[Kernel, float, FloatArray]:
     """Kernel and regulariser of the embedding by leave-one-out error (Eq. 4), and their logs.
 
@@ -98,6 +103,7 @@ def embedding_hyperparameters(
         task: number of action coordinates.
         start: log hyper-parameters (g + da + 1,) to start the fit from; None for the median.
         rng: chooses the samples of the fit.
+        tolerance: relative gain of an iteration that ends the fit.
     """
     action_factors = tuple(
         SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
@@ -113,7 +119,8 @@ def embedding_hyperparameters(
         strength=0.0,
     )
     loss = EmbeddingLoss(factor_distances(factors, inputs[sample]), targets[sample])
-    x = minimise(loss, prior, np.append(median, np.log(1e-3)) if start is None else start)
+    start = np.append(median, np.log(1e-3)) if start is None else start
+    x = minimise(loss, prior, start, tolerance=tolerance)
     return Kernel(factors, np.exp(x[:-1])), float(np.exp(x[-1])), x
 
 
@@ -135,3 +142,21 @@ def fit_embedding(
         inputs, targets, state_kernel, task, start, rng
     )
     return KernelEmbedding.fit(kernel, inputs, regulariser), x
+
+
+def fit_regression(
+    data: Transitions,
+    targets: FloatArray,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+    tolerance: float = TOLERANCE,
+) -> tuple[KernelEmbedding | PivotedEmbedding, FloatArray]:
+    """The same where only predictions are asked for: in few features, where these are enough."""
+    inputs = state_actions(data, task)
+    kernel, regulariser, x = embedding_hyperparameters(
+        inputs, targets, state_kernel, task, start, rng, tolerance
+    )
+    few = PivotedEmbedding.fit(kernel, inputs, regulariser)
+    return few or KernelEmbedding.fit(kernel, inputs, regulariser), x
