@@ -18,7 +18,7 @@ from kreps.algorithms.dynamics import (
 from kreps.algorithms.transition_model import state_actions, state_kernel
 from kreps.arrays import FloatArray, as_float
 from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.embedding import ROWS, FeatureRegression
+from kreps.embedding import ROWS, FeatureRegression, KernelEmbedding
 from kreps.kernels import Kernel, SquaredExponential
 from kreps.value import RKHSBasis
 
@@ -124,10 +124,18 @@ def test_without_noise_it_says_where_any_action_leads() -> None:
     assert np.abs(found - features[data.successor]).max() > 0.1  # other actions, other successors
 
 
+def fitted(data: Transitions, kernel: Kernel) -> tuple[Dynamics, KernelEmbedding]:
+    """The dynamics, and an embedding with their parameters that leaves nothing out."""
+    dynamics, x, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    factors = (*kernel.factors, SquaredExponential((2,)))
+    whole = Kernel(factors, np.exp(x[:-1]))
+    return dynamics, KernelEmbedding.fit(whole, state_actions(data, TASK), float(np.exp(x[-1])))
+
+
 def test_of_the_taken_actions_it_expects_the_observed_and_its_mirror_image() -> None:
     data = pushes(noise=0.3)
     kernel, basis, features = basis_of(data)
-    dynamics, model, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    dynamics, model = fitted(data, kernel)
     own, after = features[data.state], features[data.successor]
     start = features[data.start].mean(axis=0)
     expected, errors = observed_expectation(data, basis, own, after, start, dynamics, TASK)
@@ -141,10 +149,10 @@ def test_of_the_taken_actions_it_expects_the_observed_and_its_mirror_image() -> 
         predicted = data.states[i] + dynamics.motion.changes(said[None])
         mirrored = 2.0 * predicted - data.points[data.successor[i]]
         np.testing.assert_allclose(
-            expected[i], 0.5 * (after[i] + basis.features(mirrored)[0]), atol=1e-8
+            expected[i], 0.5 * (after[i] + basis.features(mirrored)[0]), atol=1e-4
         )
         np.testing.assert_allclose(
-            errors.errors[i], after[i] - basis.features(predicted)[0], atol=1e-8
+            errors.errors[i], after[i] - basis.features(predicted)[0], atol=1e-4
         )
         np.testing.assert_array_equal(errors.targets[i], after[i] - own[i])
 
@@ -246,7 +254,7 @@ def test_many_inputs_are_predicted_block_by_block() -> None:
 def test_chunks_are_told_of_the_observed_and_its_mirror_image(ended: bool) -> None:
     data = pushes(noise=0.3, ended=ended)
     kernel, basis, features = basis_of(data)
-    dynamics, model, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    dynamics, model = fitted(data, kernel)
     start = features[data.start].mean(axis=0)
     regression = FeatureRegression(dynamics.predict, 0.0)
     changes = FeatureChanges(basis, start, as_float)
@@ -259,7 +267,7 @@ def test_chunks_are_told_of_the_observed_and_its_mirror_image(ended: bool) -> No
     spread = 0.5 * (features[data.successor] + mirrored)
     ends = np.clip(said[:, -1:], 0.0, 1.0)
     assert (ends.max() > 0.01) == ended
-    np.testing.assert_allclose(expected, spread + ends * (start - spread), atol=1e-6)
+    np.testing.assert_allclose(expected, spread + ends * (start - spread), atol=1e-4)
 
 
 def test_rounding_is_not_learnt() -> None:

@@ -14,6 +14,7 @@ from kreps.embedding import (
     FeatureRegression,
     KernelEmbedding,
     LeaveOneOut,
+    PivotedEmbedding,
     RegressionSums,
     SampleModel,
 )
@@ -248,3 +249,26 @@ def test_duplicated_inputs_are_regressed_on_without_harm() -> None:
     sums = RegressionSums.of(basis.features(np.zeros((4, 1))), targets)
     found = FeatureRegression.fit(basis, sums, 1e-6)
     np.testing.assert_allclose(found.mean(np.zeros((1, 1))), 3.0, rtol=1e-5)
+
+
+@pytest.mark.parametrize("regulariser", [1e-4, 1e-2, 1.0])
+def test_few_pivots_say_what_all_samples_say(regulariser: float) -> None:
+    rng = np.random.default_rng(4)
+    inputs = rng.uniform(-1.0, 1.0, size=(300, 2))
+    targets = np.column_stack([np.sin(3.0 * inputs[:, 0]), inputs[:, 1] ** 2])
+    targets += 0.1 * rng.standard_normal(targets.shape)
+    kernel = Kernel((SquaredExponential((0,)), SquaredExponential((1,))), np.array([0.7, 0.9]))
+    exact = KernelEmbedding.fit(kernel, inputs, regulariser)
+    few = PivotedEmbedding.fit(kernel, inputs, regulariser)
+    assert few is not None and few.features.shape[1] < 100
+    assert few.basis.residual <= embedding.NEGLIGIBLE * regulariser
+    elsewhere = rng.uniform(-1.0, 1.0, size=(50, 2))
+    said, wanted = (model.predictor(targets)(elsewhere) for model in (few, exact))
+    np.testing.assert_allclose(said, wanted, atol=1e-3)
+    found, errors = (model.leave_one_out(targets).errors for model in (few, exact))
+    np.testing.assert_allclose(found, errors, atol=1e-3)
+
+
+def test_where_no_two_samples_are_alike_few_pivots_do_not_suffice() -> None:
+    kernel = Kernel((SquaredExponential((0,)),), np.array([0.1]))
+    assert PivotedEmbedding.fit(kernel, np.arange(20.0)[:, None], 0.1) is None

@@ -437,7 +437,8 @@ def test_in_low_rank_it_comes_near_the_exact_update(model: str) -> None:
     states = np.concatenate([r.observations for r in rollouts])
     for name in ("greedy", "standard_deviation"):
         mine, theirs = (getattr(each.policy.process, name)(states) for each in (found, exact))
-        np.testing.assert_allclose(mine, theirs, atol=1e-3)
+        # the exact update leaves out next to nothing of its noise, the other nothing at all
+        np.testing.assert_allclose(mine, theirs, atol=5e-3)
 
 
 def test_a_set_of_samples_is_learnt_from_in_one_step(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -536,9 +537,9 @@ def test_the_second_fit_of_the_policy_starts_from_the_first(
     starts: list[FloatArray] = []
     ends: list[FloatArray] = []
 
-    def spy(loss: Any, prior: Prior, start: FloatArray) -> FloatArray:
+    def spy(loss: Any, prior: Prior, start: FloatArray, **others: Any) -> FloatArray:
         starts.append(start)
-        ends.append(minimise(loss, prior, start))
+        ends.append(minimise(loss, prior, start, **others))
         return ends[-1]
 
     for module in (reps, transition_model):
@@ -659,11 +660,12 @@ def test_it_finds_actions_beyond_those_that_the_weights_can_choose_among(seed: i
     for _ in range(15):
         observations = rng.uniform(-1.0, 1.0, size=(9, 2))
         actions = rng.normal(-0.5, 0.6, size=(8, 1))
-        rollouts.append(Rollout(observations, actions, -((actions[:, 0] - 1.0) ** 2)))
+        rewards = -((actions[:, 0] - 1.0) ** 2) - 1e-3 * observations[:-1, 0] ** 2
+        rollouts.append(Rollout(observations, actions, rewards))
     states = rng.uniform(-0.8, 0.8, size=(50, 2))
     one, two = (
-        float(updated(rollouts, recipe=recipe)[0].policy.process.greedy(states).mean())
-        for recipe in ("observed", "default")
+        float(updated(rollouts, **changes)[0].policy.process.greedy(states).mean())
+        for changes in ({"recipe": "observed"}, {"optimism": 0.0})
     )
     assert -0.5 < one < two < 1.3
     assert abs(two - 1.0) < 0.8 * abs(one - 1.0)

@@ -27,7 +27,7 @@ from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window
 from kreps.dual import KL_TOLERANCE, DualProblem, Outcome, kl_from_uniform, solve_dual
 from kreps.errors import DataError
-from kreps.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
+from kreps.hyperparameters import TOLERANCE, PolicyLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel, factors_of
 from kreps.settings import Settings, settings_of
 
@@ -223,9 +223,9 @@ def test_the_policy_is_the_weighted_process_of_the_commanded_actions() -> None:
 def test_fits_start_where_those_of_the_last_update_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     starts: list[FloatArray] = []
 
-    def spy(loss: Any, prior: Prior, start: FloatArray) -> FloatArray:
+    def spy(loss: Any, prior: Prior, start: FloatArray, **others: Any) -> FloatArray:
         starts.append(start)
-        return minimise(loss, prior, start)
+        return minimise(loss, prior, start, **others)
 
     for module in (reps, transition_model):
         monkeypatch.setattr(module, "minimise", spy)
@@ -261,7 +261,7 @@ def test_policy_hyperparameters_are_the_most_probable_ones() -> None:
 
     best = scipy.optimize.minimize(objective, centre, method="BFGS", options={"gtol": 1e-6})
     np.testing.assert_allclose(found, best.x, atol=0.05)
-    assert objective(found) == pytest.approx(best.fun, abs=1e-4)
+    assert objective(found) == pytest.approx(best.fun, abs=TOLERANCE)
 
 
 def test_bounded_policy_hyperparameters_keep_to_their_ranges() -> None:
@@ -370,7 +370,7 @@ def test_a_constant_added_to_the_reward_changes_nothing() -> None:
 def test_equal_rewards_are_learnt_from_without_harm(recipe: str) -> None:
     settings = settings_of(recipe)
     state, info = run(with_rewards(collect(), lambda r: np.full_like(r, -3.0)), settings)
-    assert_bounded(info, settings)
+    assert_bounded(info, replace(settings, imagined=0))  # there is nothing to gain by it
     assert_usable(state)
 
 
@@ -432,10 +432,7 @@ def test_a_single_step_is_served(recipe: str) -> None:
     one = [Rollout(np.array([[0.0, 0.0], [0.1, 0.3]]), np.array([[1.0]]), np.array([-1.0]))]
     settings = settings_of(recipe)
     state, info = run(one, settings)
-    if settings.imagined:  # all that is expected of an action is that of the only one
-        np.testing.assert_allclose(info.dual.weights, np.full(settings.imagined, 0.25), atol=0.01)
-    else:
-        np.testing.assert_array_equal(info.dual.weights, [1.0])
+    np.testing.assert_array_equal(info.dual.weights, [1.0])  # nothing tells of the states
     assert info.dual.outcome is Outcome.AT_FLOOR
     assert info.support == 1
     assert_usable(state)

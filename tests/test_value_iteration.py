@@ -241,9 +241,9 @@ def test_expectations_that_are_none_do_not_blow_up() -> None:
 def test_a_fit_starts_where_that_of_the_last_update_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     starts: list[FloatArray] = []
 
-    def spy(loss: Any, prior: Prior, start: FloatArray) -> FloatArray:
+    def spy(loss: Any, prior: Prior, start: FloatArray, **others: Any) -> FloatArray:
         starts.append(start)
-        return minimise(loss, prior, start)
+        return minimise(loss, prior, start, **others)
 
     monkeypatch.setattr(transition_model, "minimise", spy)
     state = LearnerState(Window(30))

@@ -64,7 +64,8 @@ PIVOT_TOLERANCE = 1e-12
 """Of a policy that is to have few centres: largest squared residual that needs no more of them."""
 
 NEGLIGIBLE = 1e-4
-"""Part of its noise by which a policy may miss the prior variance of a support point."""
+"""Part of its noise by which a policy may miss the prior variance of a support point: its mean is
+then off by a hundredth of the noise's deviation, and its own deviation by a thousandth."""
 
 
 @dataclass(frozen=True)
@@ -122,11 +123,12 @@ class CostSensitiveGP:
 
         Kernels of smooth policies are nearly linear functions of each other.  The pivots r << m of
         a Cholesky factorisation are chosen until what they leave of any support point's kernel is
-        below `NEGLIGIBLE` times its least noise, so that C is as it was up to so small a part
-        of its noise.  A control cycle then costs r^2 instead of m^2, and to fit it m r^2 instead of
-        m^3.  Where half of the support points do not suffice, all are centres.
+        below `NEGLIGIBLE` of its least noise and of itself.  A control cycle then costs r^2 instead
+        of m^2, and to fit it m r^2 instead of m^3.  Where half of the support points do not
+        suffice, all are centres.
         """
-        tolerance = NEGLIGIBLE * self.noise / (self.signal * float(self.weights.max()))
+        least_noise = self.noise / (self.signal * float(self.weights.max()))
+        tolerance = NEGLIGIBLE * min(least_noise, 1.0)
         basis, features = RKHSBasis.fit(
             self.kernel, self.states, tolerance=tolerance, max_rank=len(self.states) // 2
         )

@@ -152,7 +152,7 @@ class Settings(OnPolicySettings):
     imagined_noise: float = 1.2
     imagined_rollouts: float = 0.5
     judging_rollouts: int = 50
-    optimism: float = 0.2
+    optimism: float = 0.1
     model: Model = "dynamics"
     features: Features = "rkhs"
     grid_size: int = 10
