@@ -122,9 +122,9 @@ class Settings(OnPolicySettings):
             if the new one earns less by more than the standard error; 0 takes every new one, as it
             is where nothing is imagined.
         optimism: about what no sample is like, where roll-outs can be simulated: share of the way
-            to the best reward that imagined actions earn more for leading there; it may be above
-            1.  It falls to 0.35 of itself at each update.  2 leads out of a local optimum that the
-            first roll-outs show nothing beyond; 0 leaves it out.
+            from the average reward to the best one that it is thought to earn, step after step
+            until the restart.  It falls to 0.35 of itself at each update.  0.1 leads out of a local
+            optimum that the first roll-outs show nothing beyond; 0 leaves it out.
         model: transition model: ``"dynamics"`` regresses how the state changes, after a linear
             trend, and takes the features of V where that leads; ``"change"`` embeds how the
             features change, so that far from the data the state stays; ``"embedding"`` embeds the
