@@ -512,7 +512,8 @@ class Fixed(Simulator):
         assert self.exploring_starts == 0.0
         chance = rng.standard_normal(count)
         rewards = policy.force * (1.0 + policy.risk * chance) + 100.0 * chance
-        return Followed(rewards[None], np.full((1, count), policy.likeness))
+        likeness = np.full((1, count), policy.likeness)
+        return Followed(rewards[None], likeness, np.zeros((1, count), dtype=bool))
 
 
 class Risky(Push):

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import kreps
+from kreps.algorithms.imagined_rollouts import Followed
 from kreps.algorithms.imagined_step import Outlook, imagine
 from kreps.algorithms.optimism import HIGHEST, KEPT, LEAST, Optimism, known_distance, optimism_of
 from kreps.arrays import FloatArray
@@ -175,9 +176,16 @@ def test_who_has_found_the_unknown_stays_there() -> None:
     known, unknown, half = 1.0, 0.0, np.exp(-0.5 * (1.0 + np.log(2.0)))
     likeness = np.array([[known, known], [known, half], [unknown, known], [known, known]])
     rewards = np.arange(8.0).reshape(4, 2)
-    found = hope.followed(rewards, likeness)
-    wanted = [[0.0, 1.0], [2.0, (3.0 + 7.0) / 2], [7.0, (5.0 + 7.0) / 2], [7.0, 7.0]]
+    never = np.zeros((4, 2), dtype=bool)
+    found = hope.hoped_rewards(Followed(rewards, likeness, never))
+    still = (7.0 + 7.0) / 2
+    wanted = [[0.0, 1.0], [2.0, (3.0 + 7.0) / 2], [7.0, (5.0 + 7.0) / 2], [7.0, still]]
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
+    # after a real end it begins anew
+    ended = never.copy()
+    ended[2] = True
+    found = hope.hoped_rewards(Followed(rewards, likeness, ended))
+    np.testing.assert_allclose(found, [*wanted[:3], [6.0, 7.0]], rtol=1e-12)
 
 
 def test_optimism_falls_at_each_update_and_ends() -> None:

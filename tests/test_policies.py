@@ -111,6 +111,20 @@ def test_the_predictor_needs_few_centres_of_a_dense_support() -> None:
     assert policy.jitter == 0.0
 
 
+@pytest.mark.parametrize(("signal", "weight"), [(1e-200, 1e-200), (1e200, 1e200)])
+def test_extreme_weights_are_served(signal: float, weight: float) -> None:
+    states, targets, _ = samples(20, 24)
+    policy = CostSensitiveGP(TASK, KERNEL, states, targets, np.full(20, weight), signal, NOISE)
+    assert np.isfinite(policy.mean(states)).all()
+    assert (policy.standard_deviation(states) > 0.0).all()
+
+
+def test_next_to_no_noise_does_not_make_all_support_points_centres() -> None:
+    states = np.random.default_rng(25).normal(size=(400, 2))
+    policy = CostSensitiveGP(TASK, KERNEL, states, states, np.ones(400), 1.0, 1e-12)
+    assert len(policy.predictor.states) < 200
+
+
 def test_support_points_that_are_all_unlike_are_all_centres() -> None:
     states = 50.0 * np.random.default_rng(23).normal(size=(40, 2))
     targets, weights = np.ones((40, 2)), np.ones(40)

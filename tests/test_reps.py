@@ -10,6 +10,7 @@ import pytest
 import scipy.optimize
 
 from kreps.algorithms import reps, transition_model
+from kreps.algorithms.boldness import ETA_FLOOR_NOT_JUDGED
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
     LearnerState,
@@ -288,7 +289,7 @@ def test_the_new_policy_pushes_towards_the_reward() -> None:
 
 
 def test_one_seed_gives_one_policy_to_the_last_byte() -> None:
-    # More than 500 points and 400 samples, so that every random choice is really made.
+    # More than 500 points and 300 samples, so that every random choice is really made.
     rollouts = collect(36, 15)
     state = fresh(40)
     first, second, other = (run(rollouts, state=state, seed=seed)[0] for seed in (7, 7, 8))
@@ -371,6 +372,8 @@ def test_equal_rewards_are_learnt_from_without_harm(recipe: str) -> None:
     settings = settings_of(recipe)
     state, info = run(with_rewards(collect(), lambda r: np.full_like(r, -3.0)), settings)
     assert_bounded(info, replace(settings, imagined=0))  # there is nothing to gain by it
+    if recipe == "default":  # and nothing is judged, so the step is as careful as where it cannot
+        assert (info.refused, info.eta_floor) == (None, ETA_FLOOR_NOT_JUDGED)
     assert_usable(state)
 
 

@@ -105,15 +105,16 @@ class KernelEmbedding:
 
 
 NEGLIGIBLE = 1e-4
-"""Part of its regulariser by which a regression may miss the kernel of a sample with itself."""
+"""Part of its regulariser by which a regression may miss the kernel of a sample with itself: what
+is left out in all is then typically below a hundredth of it."""
 
 
 @dataclass(frozen=True)
 class PivotedEmbedding:
     """`KernelEmbedding` in features of a few pivots, which leave next to nothing of its kernel out.
 
-    What is left out of ``K_sa`` would add less than `NEGLIGIBLE` lambda to each sample's lambda, so
-    nothing that the regulariser lets through is lost, at a cost of n r^2 instead of n^3.
+    What is left out of the diagonal of ``K_sa`` is below `NEGLIGIBLE` lambda, so hardly anything
+    that the regulariser lets through is lost, at a cost of n r^2 instead of n^3.
 
     Attributes:
         basis: r features psi of states and applied actions.

@@ -147,7 +147,8 @@ def factor_distances(factors: tuple[Factor, ...], x: FloatArray) -> FloatArray:
 
 
 TOLERANCE = 1e-3
-"""Relative gain of an iteration that ends a fit: less is not told apart by some hundred samples."""
+"""Gain of an iteration that ends a fit, as a share of the loss or, if that is below one, of one:
+the losses are logarithms, and some hundred samples do not tell less apart."""
 
 
 def minimise(

@@ -137,12 +137,6 @@ def inverse_lower(lower: FloatArray) -> FloatArray:
     return inverse
 
 
-def qr_factor(a: FloatArray) -> FloatArray:
-    """R (k, k) of the QR decomposition of a tall (n, k) matrix: ``R'R = A'A``, but never formed."""
-    r: FloatArray = np.linalg.qr(a, mode="r")  # type: ignore[assignment]
-    return r
-
-
 def principal_coordinates(a: FloatArray, tolerance: float = 1e-8) -> FloatArray:
     """``B`` (k, n) with ``|B x| = |A x|`` for symmetric A (n, n), up to ``tolerance |A| |x|``."""
     values, vectors = np.linalg.eigh(a)

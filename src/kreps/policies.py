@@ -61,11 +61,12 @@ MAX_SUPPORT = 6_000
 """Most support points of an exact policy: it costs their square in memory, their cube in time."""
 
 PIVOT_TOLERANCE = 1e-12
-"""Of a policy that is to have few centres: largest squared residual that needs no more of them."""
+"""Squared residual of a support point's kernel function that in no case needs another centre."""
 
 NEGLIGIBLE = 1e-4
-"""Part of its noise by which a policy may miss the prior variance of a support point: its mean is
-then off by a hundredth of the noise's deviation, and its own deviation by a thousandth."""
+"""Part of its noise by which a policy may miss the prior variance of a support point.  On learnt
+policies its mean is then off by less than a hundredth of the noise's deviation, root mean square,
+and its own deviation by a thousandth."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class CostSensitiveGP:
 
     Raises:
         ConfigurationError: more than `MAX_SUPPORT` support points.
-        NumericalError: C cannot be factorised.
+        NumericalError: C is needed, and cannot be factorised.
     """
 
     task: TaskSpec
@@ -127,8 +128,9 @@ class CostSensitiveGP:
         of m^2, and to fit it m r^2 instead of m^3.  Where half of the support points do not
         suffice, all are centres.
         """
-        least_noise = self.noise / (self.signal * float(self.weights.max()))
-        tolerance = NEGLIGIBLE * min(least_noise, 1.0)
+        with np.errstate(all="ignore"):  # of extreme numbers, which the other bounds then serve
+            least_noise = np.float64(self.noise) / self.signal / self.weights.max()
+        tolerance = float(np.clip(NEGLIGIBLE * least_noise, PIVOT_TOLERANCE, NEGLIGIBLE))
         basis, features = RKHSBasis.fit(
             self.kernel, self.states, tolerance=tolerance, max_rank=len(self.states) // 2
         )

@@ -112,7 +112,8 @@ class Settings(OnPolicySettings):
             sampled states instead of the start states, so that V is learnt beside the way, too; and
             of the imagined roll-outs that begin there.  Real ones begin where the environment does.
         imagined: actions per state that are drawn anew for a second bounded step, in which the
-            model says what they lead to; 0 leaves that step out.
+            model says what they lead to; 0 leaves that step out, and while no reward tells of the
+            states there is none.
         imagined_noise: these actions are drawn with so many times the deviation of the policy, and
             that of the policy fitted to them is divided by it; where that is judged, see below.
         imagined_rollouts: share of these actions in states that the policy is led to in roll-outs

@@ -1,7 +1,8 @@
 """A Gaussian process policy carried by few centres: what the control loop evaluates.
 
-It comes about in three ways: from an exact process without loss (`CostSensitiveGP.predictor`), from
-one with bounded size (`CostSensitiveGP.compressed`), or from sums over any number of samples.
+It comes about in three ways: from an exact process, with all centres that its noise lets one tell
+apart (`CostSensitiveGP.predictor`) or so many (`CostSensitiveGP.compressed`), or from sums over any
+number of samples.
 """
 
 from __future__ import annotations

@@ -83,7 +83,10 @@ ADDED_LATER: dict[str, dict[str, Any]] = {
         "optimism": 0.0,
     }
 }
-"""Settings by method that earlier checkpoints have not, at the values that mean what these did."""
+"""Settings by method that earlier checkpoints have not, at the values that mean what these did.
+
+An ``optimism`` that is there is taken as it is, though before it meant a reward that is paid once:
+what is left of it after a few updates is nothing either way."""
 
 ARRAYS = {"policy": POLICY_ARRAYS, "rollouts": ROLLOUT_ARRAYS, "checkpoint": CHECKPOINT_ARRAYS}
 

@@ -43,10 +43,12 @@ class Followed:
     Attributes:
         rewards: (steps, count) expected, standardised.
         likeness: (steps, count) of each state to the nearest sample: the kernel's value, up to 1.
+        ended: (steps, count) whether the task really ended, and the next state is a start.
     """
 
     rewards: FloatArray
     likeness: FloatArray
+    ended: BoolArray
 
     def feared_rewards(self, least: float, typical: float) -> FloatArray:
         """Rewards (steps, count) if what is not known is the worst.
@@ -139,15 +141,16 @@ class Simulator:
             rng: of starts, noise and ends.
         """
         steps = min(ceil(AVERAGED / self.restart_probability), self.longest)
-        asked, likeness = [], []
+        asked, likeness, ends = [], [], []
         states = self._starts(count, rng)
         for _ in range(steps):
             _, alike, inputs, successors, ended = self._step(policy, states, rng)
             asked.append(inputs)
             likeness.append(alike)
+            ends.append(ended)
             states = np.where(ended[:, None], self._starts(count, rng), successors)
         rewards = reward(np.concatenate(asked)).reshape(steps, count)
-        return Followed(rewards, np.array(likeness))
+        return Followed(rewards, np.array(likeness), np.array(ends))
 
     def _step(
         self, policy: StochasticPolicy, states: FloatArray, rng: np.random.Generator

@@ -60,7 +60,7 @@ def refuses(
         if hope is None:
             rewards = each.feared_rewards(outlook.rewards.min(), typical)
         else:
-            rewards = hope.followed(each.rewards, each.likeness)
+            rewards = hope.hoped_rewards(each)
         return average_reward(rewards, process.restart_probability)
 
     gain = earned(followed) - earned(followed_before)

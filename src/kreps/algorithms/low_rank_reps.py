@@ -149,8 +149,9 @@ def update(
     )
     errors, embedding_start = expectation.errors, expectation.parameters
     # a data set is not learnt from by imagining
+    imagining = seen is not None and imagines(settings, window, task)
     simulator = None
-    if seen is not None:
+    if imagining:
         simulator = simulator_of(expectation, sample, kernel, task, settings, window)
     judged = is_judged(simulator, settings)
     clock.lap("embedding")
@@ -197,8 +198,7 @@ def update(
 
     # the same once more, for other actions in the states of the sample and where they lead
     reward_start, refused = state.reward_start, None
-    wanted = seen is not None and imagines(settings, window, task)
-    if wanted and expectation.of_actions is not None:
+    if imagining and expectation.of_actions is not None:
         inputs = state_actions(sample, task)
         targets = (rewards[sampled] - rewards[sampled].mean())[:, None]
         reward_kernel, regulariser, reward_start = embedding_hyperparameters(

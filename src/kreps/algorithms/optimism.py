@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kreps.algorithms.imagined_rollouts import Simulator
+from kreps.algorithms.imagined_rollouts import Followed, Simulator
 from kreps.arrays import FloatArray
 from kreps.settings import Settings
 
@@ -72,14 +72,18 @@ class Optimism:
         """
         return (1.0 - restart_probability) / restart_probability * (self.hoped - self.gain)
 
-    def followed(self, rewards: FloatArray, likeness: FloatArray) -> FloatArray:
-        """Rewards (steps, count) of roll-outs in the model that find the unknown, if they do.
+    def hoped_rewards(self, followed: Followed) -> FloatArray:
+        """Rewards (steps, count) of roll-outs in the model if who finds the unknown stays there.
 
-        Args:
-            rewards, likeness: (steps, count) that the model tells of their states.
+        As unknown is a matter of degree, so is staying; a real end is followed by a start.
         """
-        known_yet = np.cumprod(1.0 - self.unknown(likeness), axis=0)
-        return self.hoped + known_yet * (rewards - self.hoped)
+        known_yet = np.ones(followed.rewards.shape[1])
+        rewards = np.empty_like(followed.rewards)
+        for t, unknown in enumerate(self.unknown(followed.likeness)):
+            known_yet = known_yet * (1.0 - unknown)
+            rewards[t] = self.hoped + known_yet * (followed.rewards[t] - self.hoped)
+            known_yet[followed.ended[t]] = 1.0
+        return rewards
 
 
 def optimism_of(

@@ -159,7 +159,10 @@ def update(
     errors = expectation.errors
     rewards, reward_unit = standardise(data.rewards)
     jitters = [expectation.jitter]
-    simulator = simulator_of(expectation, data, kernel, task, settings, window)
+    imagining = imagines(settings, window, task)
+    simulator = None
+    if imagining:
+        simulator = simulator_of(expectation, data, kernel, task, settings, window)
     judged = is_judged(simulator, settings)
     clock.lap("embedding")
 
@@ -188,7 +191,7 @@ def update(
 
     # the same once more, for other actions in these states and where they lead
     reward_start, refused = state.reward_start, None
-    if expectation.of_actions is not None and imagines(settings, window, task):
+    if imagining and expectation.of_actions is not None:
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
         targets = (rewards - rewards.mean())[:, None]
         regression, reward_start = fit_regression(
@@ -307,7 +310,7 @@ def simulator_of(
         kernel: over states.
         task, settings, window: of the update.
     """
-    dynamics = expectation.dynamics if settings.imagined else None
+    dynamics = expectation.dynamics
     if dynamics is None or not can_be_simulated(data, task):
         return None
     return Simulator(

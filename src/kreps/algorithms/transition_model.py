@@ -103,7 +103,7 @@ def embedding_hyperparameters(
         task: number of action coordinates.
         start: log hyper-parameters (g + da + 1,) to start the fit from; None for the median.
         rng: chooses the samples of the fit.
-        tolerance: relative gain of an iteration that ends the fit.
+        tolerance: gain of an iteration that ends the fit, as in `minimise`.
     """
     action_factors = tuple(
         SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
