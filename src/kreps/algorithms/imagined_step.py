@@ -2,10 +2,10 @@
 
 The weights of Eq. 1 can only choose among the actions that happened to be taken, one in each state.
 A transition model predicts for *any* action, so more can be asked of the same roll-outs: in the
-states as the first step reweighted them, and in those that the model leads its policy to, actions
-are drawn from this policy, and the same convex problem is solved once more for them.  The KL bound
-then holds from what they were drawn from, so that old roll-outs no longer tie the new policy to the
-old ones that made them.
+states as the first step reweighted them actions are drawn from its policy, and the same convex
+problem is solved once more for them.  The KL bound then holds from what they were drawn from, so
+that old roll-outs no longer tie the new policy to the old ones that made them.  And the policy so
+found is led by the model to states that no sample is in: there the same is done once again.
 
 What is compared in the model can be wide, and what is done in the world narrow: actions are drawn
 with more than the policy's deviation, and the one fitted to them acts with as much less of its own.
@@ -103,6 +103,12 @@ def resample(p: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
     return np.minimum(np.searchsorted(np.cumsum(p), places * p.sum()), len(p) - 1)
 
 
+def places(outlook: Outlook, settings: Settings) -> tuple[bool, ...]:
+    """Where actions are imagined, step after step: not led, in sampled states, then led."""
+    share = settings.imagined_rollouts if outlook.simulator is not None else 0.0
+    return tuple(led for led, part in ((False, 1.0 - share), (True, share)) if part > 0.0)
+
+
 def imagine(
     outlook: Outlook,
     weights: FloatArray,
@@ -111,29 +117,34 @@ def imagine(
     settings: Settings,
     ridge: float,
     rng: np.random.Generator,
+    led: bool = False,
 ) -> ImaginedSamples:
-    """Actions around the policy's in states drawn by the weights (n,) and in states it is led to.
+    """Actions around the policy's in states drawn by the weights (n,) or in states it is led to.
 
     Args:
         outlook, weights: of n samples.
         policy: to draw actions from.
         task: limits and scale of the actions.
-        settings: ``imagined`` draws a sample, up to `MOST_IMAGINED` in all, with
+        settings: ``imagined`` draws a sample, up to `MOST_IMAGINED` in both places, with
             ``imagined_noise``; the share of them in ``imagined_rollouts``; the bounds.
         ridge: rho times the number of draws.
         rng: of the draws.
+        led: whether the states are those of simulated roll-outs of the policy, as many as there are
+            samples.
     """
-    count = min(settings.imagined * len(weights), MOST_IMAGINED)
-    ahead = 0 if outlook.simulator is None else round(settings.imagined_rollouts * count)
-    rows, of = np.unique(resample(weights, count - ahead, rng), return_inverse=True)
-    states, features = outlook.states[rows], outlook.features[rows]
-    if outlook.simulator is not None and ahead:
-        wanted = -(-ahead // settings.imagined)
-        led, nearest = outlook.simulator.rollouts(policy, wanted, rng)
-        of = np.concatenate([of, len(rows) + np.arange(ahead) * len(led) // ahead])
-        rows = np.concatenate([rows, nearest])
-        states = np.concatenate([states, led])
-        features = np.concatenate([features, outlook.features_at(led)])
+    n = len(weights)
+    whole = min(settings.imagined * n, MOST_IMAGINED)
+    ahead = round(settings.imagined_rollouts * whole) if True in places(outlook, settings) else 0
+    if led:
+        assert outlook.simulator is not None
+        count = ahead
+        states, rows = outlook.simulator.rollouts(policy, min(n, count), rng)
+        of = np.arange(count) * len(states) // count
+        features = outlook.features_at(states)
+    else:
+        count = whole - ahead
+        rows, of = np.unique(resample(weights, count, rng), return_inverse=True)
+        states, features = outlook.states[rows], outlook.features[rows]
     judged = is_judged(outlook.simulator, settings)
     noise = widening(judged, settings) * rng.standard_normal((count, task.action_size))
     actions = policy.act(states[of], noise)

@@ -31,7 +31,7 @@ from kreps.algorithms.chunk_sums import (
     Successors,
 )
 from kreps.algorithms.dynamics import Dynamics, Motion, after_ends, observed_expectation
-from kreps.algorithms.imagined_step import Outlook, imagine
+from kreps.algorithms.imagined_step import Outlook, imagine, places
 from kreps.algorithms.judgement import refuses
 from kreps.algorithms.optimism import optimism_of
 from kreps.algorithms.reps import (
@@ -189,14 +189,15 @@ def update(
     )
     x = policy_hyperparameters(support, kernel, settings, state.policy_start, rng)
     clock.lap("policy fit")
-    bases, jitters = [basis, *expectation.bases], [expectation.jitter]
+    jitters = [expectation.jitter]
     centres = policy_centres(support, kernel, x, settings, rng)
+    bases = [basis, *expectation.bases, centres]
     policy_sums_of = ChunkPolicySums(centres, task, place)
     policy_sums = reduce(add, compute.map(policy_sums_of, dataset.chunks, dataset.split(weights)))
     policy = fit_sparse(task, centres, policy_sums, x, float(np.exp(x[-1])))
     clock.lap("policy")
 
-    # the same once more, for other actions in the states of the sample and where they lead
+    # the same once more, for other actions in the sample's states, and again where they lead to
     reward_start, refused = state.reward_start, None
     if imagining and expectation.of_actions is not None:
         inputs = state_actions(sample, task)
@@ -222,19 +223,22 @@ def update(
             simulator=simulator,
             optimism=optimism_of(simulator, rewards[sampled], share, state.iteration, settings),
         )
-        imagined = imagine(outlook, share, policy, task, settings, ridge, rng)
-        # V is nearly known, the temperature is to be found anew: it may have to rise
-        dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
-        support = PolicySamples.imagined(imagined, dual.weights, task)
-        x = policy_hyperparameters(support, kernel, settings, x, rng)
-        centres = policy_centres(support, kernel, x, settings, rng)
-        weights, noise = drawn_noise(support, float(np.exp(x[-1])))
-        policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
-        policy = fit_sparse(task, centres, policy_sums, x, noise, 1.0 / widening(judged, settings))
+        for led in places(outlook, settings):
+            imagined = imagine(outlook, share, policy, task, settings, ridge, rng, led)
+            # V is nearly known, the temperature is to be found anew: it may have to rise
+            dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
+            found = PolicySamples.imagined(imagined, dual.weights, task)
+            both = led and settings.imagined_rollouts < 1.0
+            support = found.beside(support) if both else found
+            x = policy_hyperparameters(support, kernel, settings, x, rng)
+            bases.append(centres := policy_centres(support, kernel, x, settings, rng))
+            weights, noise = drawn_noise(support, float(np.exp(x[-1])))
+            policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
+            policy = fit_sparse(task, centres, policy_sums, x, noise)
+        policy = policy.narrowed(widening(judged, settings))
         clock.lap("imagined step")
         refused = refuses(policy, state.policy, outlook, settings, rng)
         clock.lap("judgement")
-    bases.append(centres)
 
     new_state = state.after_data(
         *(seen or (count, n)),
@@ -414,15 +418,9 @@ def fit_sparse(
     sums: PolicySums,
     x: FloatArray,
     noise: float,
-    deviation: float = 1.0,
 ) -> SparseGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,), its own deviation times ``deviation``.
-
-    Until then its actions are drawn with ``noise``.
-    """
-    scale = deviation**2  # of signal and noise alike, so that the mean stays
-    signal = scale * float(np.exp(x[-2]))
-    return SparseGP.fit(task, centres, sums, signal=signal, noise=scale * noise)
+    """The policy at log hyper-parameters ``x`` (g + 2,); its actions are drawn with ``noise``."""
+    return SparseGP.fit(task, centres, sums, signal=float(np.exp(x[-2])), noise=noise)
 
 
 def solve(

@@ -12,7 +12,7 @@ import numpy as np
 from kreps.algorithms.boldness import is_judged, least_temperature, widening
 from kreps.algorithms.dynamics import Dynamics, fit_dynamics, observed_expectation
 from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
-from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine
+from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine, places
 from kreps.algorithms.judgement import refuses
 from kreps.algorithms.optimism import optimism_of
 from kreps.algorithms.state import LearnerState, Stopwatch
@@ -189,7 +189,7 @@ def update(
     policy = fit_policy(support, kernel, task, policy_x)
     clock.lap("policy")
 
-    # the same once more, for other actions in these states and where they lead
+    # the same once more, for other actions in these states, and again in those they lead to
     reward_start, refused = state.reward_start, None
     if imagining and expectation.of_actions is not None:
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
@@ -209,12 +209,18 @@ def update(
             simulator=simulator,
             optimism=optimism_of(simulator, rewards, dual.weights, state.iteration, settings),
         )
-        imagined = imagine(outlook, dual.weights, policy, task, settings, ridge, rng)
-        # V is nearly known, the temperature is to be found anew: it may have to rise
-        dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
-        support = PolicySamples.imagined(imagined, dual.weights, task).heaviest(MAX_SUPPORT)
-        policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
-        policy = fit_policy(support, kernel, task, policy_x, 1.0 / widening(judged, settings))
+        first = dual
+        for led in places(outlook, settings):
+            imagined = imagine(outlook, first.weights, policy, task, settings, ridge, rng, led)
+            # V is nearly known, the temperature is to be found anew: it may have to rise
+            dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
+            found = PolicySamples.imagined(imagined, dual.weights, task)
+            # where the policy is led to it has more to learn, but keeps what it was told elsewhere
+            both = led and settings.imagined_rollouts < 1.0
+            support = (found.beside(support) if both else found).heaviest(MAX_SUPPORT)
+            policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
+            policy = fit_policy(support, kernel, task, policy_x)
+        policy = policy.narrowed(widening(judged, settings))
         clock.lap("imagined step")
         refused = refuses(policy, state.policy, outlook, settings, rng)
         clock.lap("judgement")
@@ -466,6 +472,18 @@ class PolicySamples:
         evidence = float(weights.sum())
         return cls(samples.states[rows], targets, weights, evidence, within, spread)
 
+    def beside(self, earlier: PolicySamples) -> PolicySamples:
+        """These and those of an earlier step."""
+        told = np.array([self.weights.sum(), earlier.weights.sum()])
+        return PolicySamples(
+            np.concatenate([self.states, earlier.states]),
+            np.concatenate([self.targets, earlier.targets]),
+            np.concatenate([self.weights, earlier.weights]),
+            self.evidence + earlier.evidence,
+            np.concatenate([self.within, earlier.within]),
+            float(told @ [self.spread, earlier.spread] / told.sum()),
+        )
+
     def heaviest(self, most: int) -> PolicySamples:
         """At most so many of them, in order."""
         if len(self.weights) <= most:
@@ -545,17 +563,15 @@ def fit_policy(
     state_kernel: Kernel,
     task: TaskSpec,
     x: FloatArray,
-    deviation: float = 1.0,
 ) -> CostSensitiveGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,), its own deviation times ``deviation``."""
+    """The policy at log hyper-parameters ``x`` (g + 2,)."""
     weights, noise = drawn_noise(samples, float(np.exp(x[-1])))
-    scale = deviation**2  # of signal and noise alike, so that the mean stays
     return CostSensitiveGP(
         task,
         state_kernel.with_lengthscales(np.exp(x[:-2])),
         samples.states,
         samples.targets,
         weights,
-        signal=scale * float(np.exp(x[-2])),
-        noise=scale * noise,
+        signal=float(np.exp(x[-2])),
+        noise=noise,
     )
