@@ -61,6 +61,14 @@ def tells_of_states(rollouts: Sequence[Rollout], task: TaskSpec) -> bool:
     return not (exact and rewards.max() <= of_idle @ price + least)
 
 
+def each_tells(rollouts: Sequence[Rollout], task: TaskSpec) -> bool:
+    """Whether the rewards of each roll-out tell of its states: if not, a goal is known from others.
+
+    Those too short to know are taken to tell.
+    """
+    return all(tells_of_states([rollout], task) for rollout in rollouts)
+
+
 def extended(window: Window, rollouts: Sequence[Rollout], task: TaskSpec) -> Window:
     """The window with new roll-outs: the latest, a third of it kept for those that tell of states.
 

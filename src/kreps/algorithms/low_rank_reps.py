@@ -42,6 +42,7 @@ from kreps.algorithms.reps import (
     drawn_noise,
     imagines,
     policy_hyperparameters,
+    remembers,
     share_clipped,
     simulator_of,
     stationarity_ridge,
@@ -223,13 +224,13 @@ def update(
             simulator=simulator,
             optimism=optimism_of(simulator, rewards[sampled], share, state.iteration, settings),
         )
+        remembering = remembers(settings, window, task)
         for led in places(outlook, settings):
             imagined = imagine(outlook, share, policy, task, settings, ridge, rng, led)
             # V is nearly known, the temperature is to be found anew: it may have to rise
             dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
             found = PolicySamples.imagined(imagined, dual.weights, task)
-            both = led and settings.imagined_rollouts < 1.0
-            support = found.beside(support) if both else found
+            support = found.beside(support) if led and remembering else found
             x = policy_hyperparameters(support, kernel, settings, x, rng)
             bases.append(centres := policy_centres(support, kernel, x, settings, rng))
             weights, noise = drawn_noise(support, float(np.exp(x[-1])))

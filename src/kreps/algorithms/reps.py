@@ -37,7 +37,7 @@ from kreps.dual import (
     standardise,
 )
 from kreps.embedding import KernelEmbedding, LeaveOneOut, SampleModel, TransitionModel
-from kreps.exploration import tells_of_states
+from kreps.exploration import each_tells, tells_of_states
 from kreps.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel
 from kreps.policies import MAX_SUPPORT, CostSensitiveGP
@@ -210,14 +210,15 @@ def update(
             optimism=optimism_of(simulator, rewards, dual.weights, state.iteration, settings),
         )
         first = dual
+        remembering = remembers(settings, window, task)
         for led in places(outlook, settings):
             imagined = imagine(outlook, first.weights, policy, task, settings, ridge, rng, led)
             # V is nearly known, the temperature is to be found anew: it may have to rise
             dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
             found = PolicySamples.imagined(imagined, dual.weights, task)
-            # where the policy is led to it has more to learn, but keeps what it was told elsewhere
-            both = led and settings.imagined_rollouts < 1.0
-            support = (found.beside(support) if both else found).heaviest(MAX_SUPPORT)
+            support = (found.beside(support) if led and remembering else found).heaviest(
+                MAX_SUPPORT
+            )
             policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
             policy = fit_policy(support, kernel, task, policy_x)
         policy = policy.narrowed(widening(judged, settings))
@@ -267,6 +268,16 @@ def imagines(settings: Settings, window: Window, task: TaskSpec) -> bool:
     The next roll-outs then explore, whatever is learnt (`OnPolicyLearner.exploring`).
     """
     return settings.imagined > 0 and tells_of_states(window.rollouts, task)
+
+
+def remembers(settings: Settings, window: Window, task: TaskSpec) -> bool:
+    """Whether a policy that is led by the model keeps its targets in sampled states beside those.
+
+    Where it is at home it has most to learn, and learns it better by itself.  But where some
+    roll-outs tell nothing of the states, a goal is known from few samples only, and a policy that
+    is not led there would forget it.
+    """
+    return settings.imagined_rollouts < 1.0 and not each_tells(window.rollouts, task)
 
 
 def value_basis(data: Transitions, kernel: Kernel, settings: Settings) -> tuple[Basis, FloatArray]:
