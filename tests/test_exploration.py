@@ -16,6 +16,7 @@ from kreps.exploration import (
     RED,
     WHITE,
     coloured_noise,
+    each_tells,
     extended,
     latest,
     tells_alone,
@@ -187,6 +188,17 @@ def test_one_roll_out_tells_if_it_is_long_enough() -> None:
     assert tells_alone(rollout(GOAL, steps=7), TASK)  # two actions have six terms
     assert not tells_alone(rollout(GOAL, steps=6), TASK)
     assert not tells_alone(rollout(PRICE, steps=20), TASK)
+
+
+def test_a_roll_out_that_tells_nothing_is_noticed_unless_it_is_too_short_to_know() -> None:
+    telling = [rollout(GOAL, seed, steps=20) for seed in range(3)]
+    assert each_tells(telling, TASK)
+    assert not each_tells([*telling, rollout(PRICE, steps=20)], TASK)
+    for steps in (1, 6):
+        assert each_tells([*telling, rollout(PRICE, steps=steps)], TASK)
+    learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=0)
+    learner.learn(1, progress=False)
+    assert each_tells(learner.state.window.rollouts, learner.task)
 
 
 @pytest.mark.parametrize(

@@ -373,10 +373,37 @@ def test_each_state_has_its_own_features_and_the_noise_of_its_sample(
     assert np.abs(other - outlook.expect(rows, inputs)).max() > 5e-5
 
 
+def one_silent() -> list[Rollout]:
+    """Roll-outs of which one tells nothing of the states."""
+    first, *others = turns()
+    return [replace(first, rewards=np.full(len(first), others[0].rewards.min())), *others]
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted"])
+def test_sampled_states_stay_in_the_policy_where_not_each_roll_out_tells(
+    approximation: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module: Any = reps if approximation == "exact" else low_rank_reps
+    fitted: list[reps.PolicySamples] = []
+    fit = module.policy_hyperparameters
+
+    def watch(samples: reps.PolicySamples, *others: Any) -> FloatArray:
+        fitted.append(samples)
+        return fit(samples, *others)
+
+    monkeypatch.setattr(module, "policy_hyperparameters", watch)
+    shares = []
+    for given in (turns(), one_silent()):
+        kreps.KREPS(TASK, approximation=approximation).update(given)
+        seen = {s.tobytes() for r in given for s in r.observations}
+        shares.append(np.mean([s.tobytes() in seen for s in fitted[-1].states]))
+    assert shares[0] < 0.3 < shares[1]
+
+
 def test_the_support_of_an_exact_policy_has_a_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     def learnt() -> kreps.KREPS:
         learner = kreps.KREPS(TASK, approximation="exact", kl_bound=0.01)  # all weigh alike
-        learner.update(turns())
+        learner.update(one_silent())
         return learner
 
     many = learnt()

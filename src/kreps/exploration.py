@@ -66,7 +66,7 @@ def each_tells(rollouts: Sequence[Rollout], task: TaskSpec) -> bool:
 
     Those too short to know are taken to tell.
     """
-    return all(tells_of_states([rollout], task) for rollout in rollouts)
+    return all(tells_alone(rollout, task) for rollout in rollouts if is_long_enough(rollout, task))
 
 
 def extended(window: Window, rollouts: Sequence[Rollout], task: TaskSpec) -> Window:
@@ -99,8 +99,12 @@ def _reserved(window: Window) -> int:
 
 def tells_alone(rollout: Rollout, task: TaskSpec) -> bool:
     """Whether the rewards of one roll-out tell of states, and it is long enough to know."""
-    terms = quadratic_terms(np.zeros((1, task.action_size))).shape[1]
-    return len(rollout) > terms and tells_of_states([rollout], task)
+    return is_long_enough(rollout, task) and tells_of_states([rollout], task)
+
+
+def is_long_enough(rollout: Rollout, task: TaskSpec) -> bool:
+    """Whether a price of the actions cannot explain just any rewards of a roll-out."""
+    return len(rollout) > quadratic_terms(np.zeros((1, task.action_size))).shape[1]
 
 
 def quadratic_terms(actions: FloatArray) -> FloatArray:
