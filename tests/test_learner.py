@@ -484,9 +484,8 @@ def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem(
     recipe: str,
 ) -> None:
     # Measured over seeds 0 to 7: with the recipe "observed" the cost is 1.02 to 1.11 of the optimum
-    # for seven, 1.32 for one.  With the default it is 1.03 to 1.19; after six updates, when it has
-    # just looked around, 1.01 to 1.22 for six and 1.46 and 1.68 for two.  The first policy costs 54
-    # times the optimum, doing nothing 4.6.
+    # for seven, 1.32 for one.  With the default it is 1.02 to 1.19, after six updates 1.02 to 1.13.
+    # The first policy costs 54 times the optimum, doing nothing 4.6.
     _, best = optimum()
     shares = []
     for seed in range(5):
