@@ -116,9 +116,9 @@ class Settings(OnPolicySettings):
             states there is none.
         imagined_noise: these actions are drawn with so many times the deviation of the policy, and
             that of the policy fitted to them is divided by it; where that is judged, see below.
-        imagined_rollouts: share of these actions in states that the policy is led to in roll-outs
-            simulated by the model ``"dynamics"``, the others in sampled states.  There are none in
-            images, nor with fewer than ten samples for each coordinate of state and action.
+        imagined_rollouts: share of these actions that a third step takes, in states that the policy
+            of the second is led to in roll-outs simulated by the model ``"dynamics"``.  There are
+            none in images, nor with fewer than ten samples for each coordinate of state and action.
         judging_rollouts: simulated likewise, of the new policy and of the one before, which acts on
             if the new one earns less by more than the standard error; 0 takes every new one, as it
             is where nothing is imagined.

@@ -81,7 +81,7 @@ class UpdateInfo:
         state_lengthscales: of V's kernel.
         embedding_parameters, policy_parameters: fitted values (not logs): lengthscales, then
             lambda, or sf2 and l.  The former are those of the transition model, whichever it is.
-            After a widened second step the policy has its sf2 and noise divided.
+            After widened imagined steps the policy has its sf2 and noise divided.
         noise: variance that actions are drawn with, in units of the action scale squared, by the
             fitted policy.
         refused: whether the model found the fitted policy worse than the one before, which then
