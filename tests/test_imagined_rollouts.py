@@ -276,6 +276,15 @@ def test_a_share_of_the_actions_is_drawn_along_them(
     assert len(outlooks) == (2 if 0.0 < share < 1.0 else 1)
 
 
+@pytest.mark.parametrize(("share", "drawn"), [(0.001, "sampled"), (0.999, "led to")])
+def test_a_share_of_less_than_one_action_is_none(share: float, drawn: str) -> None:
+    learner, info = updated(imagined_rollouts=share)
+    assert len(info.dual.weights) == 480
+    seen = {s.tobytes() for r in turns() for s in r.observations}
+    known = np.mean([s.tobytes() in seen for s in learner.policy.process.states])
+    assert (known == 1.0) == (drawn == "sampled")
+
+
 def outlook_of(
     rollouts: list[Rollout], monkeypatch: pytest.MonkeyPatch, **settings: Any
 ) -> Outlook:

@@ -620,9 +620,11 @@ def test_the_deviation_of_a_policy_can_be_less_and_its_mean_the_same() -> None:
     basis, features = RKHSBasis.fit(kernel, states, tolerance=1e-6, max_rank=20)
     sums = PolicySums.of(features, samples.weights, targets)
     sparse = SparseGP.fit(TASK, basis, sums, signal=0.8, noise=0.5)
-    exact = (fit_policy(replace(samples, spread=s), kernel, TASK, x) for s in (0.02, np.inf))
-    for wide in (*exact, sparse):
-        narrow = wide.narrowed(2.0)
+    pairs: list[tuple[Any, ...]] = [
+        tuple(fit_policy(replace(samples, spread=s), kernel, TASK, x, n) for n in (1.0, 2.0))
+        for s in (0.02, np.inf)
+    ]
+    for wide, narrow in (*pairs, (sparse, sparse.narrowed(2.0))):
         np.testing.assert_allclose(narrow.greedy(asked), wide.greedy(asked), atol=1e-9)
         np.testing.assert_allclose(
             narrow.standard_deviation(asked), 0.5 * wide.standard_deviation(asked), atol=1e-9

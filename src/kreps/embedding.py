@@ -146,7 +146,7 @@ class PivotedEmbedding:
 
     def leave_one_out(self, targets: FloatArray) -> LeaveOneOut:
         """In closed form, of targets (n, r)."""
-        return FeatureRegression.leave_one_out(self.features, targets, self.regulariser)
+        return feature_leave_one_out(self.factor, self.features, targets)
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,14 @@ class FeatureRegression:
         Where these are a part of the samples, each ``stands_for`` as many of them.
         """
         factor = cholesky(with_diagonal(stands_for * (psi.T @ psi), regulariser))
-        residuals = targets - psi @ factor.solve(stands_for * (psi.T @ targets))
-        whitened = solve_lower(factor.lower, psi.T)
-        leverage = np.minimum(np.einsum("ij,ij->j", whitened, whitened), 1.0 - 1e-12)
-        return LeaveOneOut(targets, residuals / (1.0 - leverage)[:, None])
+        return feature_leave_one_out(factor, psi, targets, stands_for)
+
+
+def feature_leave_one_out(
+    factor: Cholesky, psi: FloatArray, targets: FloatArray, stands_for: float = 1.0
+) -> LeaveOneOut:
+    """That of targets (n, r) on features psi (n, q), by the factor of ``Psi'Psi + lambda I``."""
+    residuals = targets - psi @ factor.solve(stands_for * (psi.T @ targets))
+    whitened = solve_lower(factor.lower, psi.T)
+    leverage = np.minimum(np.einsum("ij,ij->j", whitened, whitened), 1.0 - 1e-12)
+    return LeaveOneOut(targets, residuals / (1.0 - leverage)[:, None])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
 
@@ -165,10 +165,6 @@ class CostSensitiveGP:
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
         return self.predictor.act(states, noise)
-
-    def narrowed(self, times: float) -> CostSensitiveGP:
-        """With a deviation so many times smaller, of process and noise alike: the mean stays."""
-        return replace(self, signal=self.signal / times**2, noise=self.noise / times**2)
 
     def compressed(self, centres: int) -> SparseGP:
         """This policy on at most ``centres`` support points, for small computers.

@@ -2,8 +2,8 @@
 
 The weights of the first step say where the new policy will be, but only among the states that old
 policies were in.  On its own way, and just beside it, nothing would say what to do.  The dynamics
-know where it leads, so a part of the second step's actions is imagined there.  And what the policy
-of the second step earns can be foretold before it acts: see `kreps.algorithms.judgement`.
+know where it leads, so a third step imagines actions there.  And what its policy earns can be
+foretold before it acts: see `kreps.algorithms.judgement`.
 """
 
 from __future__ import annotations

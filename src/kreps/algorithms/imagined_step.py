@@ -103,10 +103,17 @@ def resample(p: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
     return np.minimum(np.searchsorted(np.cumsum(p), places * p.sum()), len(p) - 1)
 
 
+def counts(outlook: Outlook, settings: Settings) -> tuple[int, int]:
+    """How many actions are imagined in sampled states, and in states that a policy is led to."""
+    whole = min(settings.imagined * len(outlook.states), MOST_IMAGINED)
+    ahead = round(settings.imagined_rollouts * whole) if outlook.simulator is not None else 0
+    return whole - ahead, ahead
+
+
 def places(outlook: Outlook, settings: Settings) -> tuple[bool, ...]:
     """Where actions are imagined, step after step: not led, in sampled states, then led."""
-    share = settings.imagined_rollouts if outlook.simulator is not None else 0.0
-    return tuple(led for led, part in ((False, 1.0 - share), (True, share)) if part > 0.0)
+    sampled, ahead = counts(outlook, settings)
+    return (False,) * (sampled > 0) + (True,) * (ahead > 0)
 
 
 def imagine(
@@ -130,19 +137,15 @@ def imagine(
         ridge: rho times the number of draws.
         rng: of the draws.
         led: whether the states are those of simulated roll-outs of the policy, as many as there are
-            samples.
+            samples: one of `places`.
     """
-    n = len(weights)
-    whole = min(settings.imagined * n, MOST_IMAGINED)
-    ahead = round(settings.imagined_rollouts * whole) if True in places(outlook, settings) else 0
+    count = counts(outlook, settings)[led]
     if led:
         assert outlook.simulator is not None
-        count = ahead
-        states, rows = outlook.simulator.rollouts(policy, min(n, count), rng)
+        states, rows = outlook.simulator.rollouts(policy, min(len(weights), count), rng)
         of = np.arange(count) * len(states) // count
         features = outlook.features_at(states)
     else:
-        count = whole - ahead
         rows, of = np.unique(resample(weights, count, rng), return_inverse=True)
         states, features = outlook.states[rows], outlook.features[rows]
     judged = is_judged(outlook.simulator, settings)

@@ -42,7 +42,6 @@ from kreps.algorithms.reps import (
     drawn_noise,
     imagines,
     policy_hyperparameters,
-    remembers,
     share_clipped,
     simulator_of,
     stationarity_ridge,
@@ -68,6 +67,7 @@ from kreps.dual import (
     standardise,
 )
 from kreps.embedding import FeatureRegression, LeaveOneOut, RegressionSums
+from kreps.exploration import each_tells
 from kreps.kernels import Kernel
 from kreps.policies import MAX_SUPPORT
 from kreps.settings import Settings
@@ -151,9 +151,9 @@ def update(
     errors, embedding_start = expectation.errors, expectation.parameters
     # a data set is not learnt from by imagining
     imagining = seen is not None and imagines(settings, window, task)
-    simulator = None
-    if imagining:
-        simulator = simulator_of(expectation, sample, kernel, task, settings, window)
+    simulator = (
+        simulator_of(expectation, sample, kernel, task, settings, window) if imagining else None
+    )
     judged = is_judged(simulator, settings)
     clock.lap("embedding")
 
@@ -224,18 +224,19 @@ def update(
             simulator=simulator,
             optimism=optimism_of(simulator, rewards[sampled], share, state.iteration, settings),
         )
-        remembering = remembers(settings, window, task)
+        earlier, forgetful = None, not each_tells(window.rollouts, task)
         for led in places(outlook, settings):
             imagined = imagine(outlook, share, policy, task, settings, ridge, rng, led)
             # V is nearly known, the temperature is to be found anew: it may have to rise
             dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
             found = PolicySamples.imagined(imagined, dual.weights, task)
-            support = found.beside(support) if led and remembering else found
+            support = found.beside(earlier) if earlier is not None and forgetful else found
             x = policy_hyperparameters(support, kernel, settings, x, rng)
             bases.append(centres := policy_centres(support, kernel, x, settings, rng))
             weights, noise = drawn_noise(support, float(np.exp(x[-1])))
             policy_sums = PolicySums.of(centres.features(support.states), weights, support.targets)
             policy = fit_sparse(task, centres, policy_sums, x, noise)
+            earlier = found
         policy = policy.narrowed(widening(judged, settings))
         clock.lap("imagined step")
         refused = refuses(policy, state.policy, outlook, settings, rng)

@@ -160,9 +160,9 @@ def update(
     rewards, reward_unit = standardise(data.rewards)
     jitters = [expectation.jitter]
     imagining = imagines(settings, window, task)
-    simulator = None
-    if imagining:
-        simulator = simulator_of(expectation, data, kernel, task, settings, window)
+    simulator = (
+        simulator_of(expectation, data, kernel, task, settings, window) if imagining else None
+    )
     judged = is_judged(simulator, settings)
     clock.lap("embedding")
 
@@ -209,19 +209,21 @@ def update(
             simulator=simulator,
             optimism=optimism_of(simulator, rewards, dual.weights, state.iteration, settings),
         )
-        first = dual
-        remembering = remembers(settings, window, task)
-        for led in places(outlook, settings):
+        first, earlier, steps = dual, None, places(outlook, settings)
+        # a goal that some roll-outs have not reached is known from few samples, and a policy that
+        # the model does not lead there would forget it
+        forgetful = not each_tells(window.rollouts, task)
+        for led in steps:
             imagined = imagine(outlook, first.weights, policy, task, settings, ridge, rng, led)
             # V is nearly known, the temperature is to be found anew: it may have to rise
             dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
             found = PolicySamples.imagined(imagined, dual.weights, task)
-            support = (found.beside(support) if led and remembering else found).heaviest(
-                MAX_SUPPORT
-            )
+            support = found.beside(earlier) if earlier is not None and forgetful else found
+            support = support.heaviest(MAX_SUPPORT)
             policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
-            policy = fit_policy(support, kernel, task, policy_x)
-        policy = policy.narrowed(widening(judged, settings))
+            narrower = widening(judged, settings) if led == steps[-1] else 1.0
+            policy = fit_policy(support, kernel, task, policy_x, narrower)
+            earlier = found
         clock.lap("imagined step")
         refused = refuses(policy, state.policy, outlook, settings, rng)
         clock.lap("judgement")
@@ -263,21 +265,11 @@ def update(
 
 
 def imagines(settings: Settings, window: Window, task: TaskSpec) -> bool:
-    """Whether a second step is wanted: where no reward tells of the states, it has nothing to gain.
+    """Whether other actions are: where no reward tells of the states, they have nothing to gain.
 
     The next roll-outs then explore, whatever is learnt (`OnPolicyLearner.exploring`).
     """
     return settings.imagined > 0 and tells_of_states(window.rollouts, task)
-
-
-def remembers(settings: Settings, window: Window, task: TaskSpec) -> bool:
-    """Whether a policy that is led by the model keeps its targets in sampled states beside those.
-
-    Where it is at home it has most to learn, and learns it better by itself.  But where some
-    roll-outs tell nothing of the states, a goal is known from few samples only, and a policy that
-    is not led there would forget it.
-    """
-    return settings.imagined_rollouts < 1.0 and not each_tells(window.rollouts, task)
 
 
 def value_basis(data: Transitions, kernel: Kernel, settings: Settings) -> tuple[Basis, FloatArray]:
@@ -574,8 +566,9 @@ def fit_policy(
     state_kernel: Kernel,
     task: TaskSpec,
     x: FloatArray,
+    narrower: float = 1.0,
 ) -> CostSensitiveGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,)."""
+    """The policy at log hyper-parameters ``x`` (g + 2,), its deviation so many times smaller."""
     weights, noise = drawn_noise(samples, float(np.exp(x[-1])))
     return CostSensitiveGP(
         task,
@@ -583,6 +576,6 @@ def fit_policy(
         samples.states,
         samples.targets,
         weights,
-        signal=float(np.exp(x[-2])),
-        noise=noise,
+        signal=float(np.exp(x[-2])) / narrower**2,  # of process and noise, so that the mean stays
+        noise=noise / narrower**2,
     )
