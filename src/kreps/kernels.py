@@ -54,6 +54,20 @@ class Periodic:
         return xp.concat([xp.cos(angles), xp.sin(angles)], axis=1)
 
 
+@dataclass(frozen=True)
+class CutAngle:
+    """``exp(-|x - y|^2 / (2 l^2))`` of an angle by its number, from ``begin`` to a turn later.
+
+    Beside a periodic factor of the same angle it tells the two sides of the cut apart, where the
+    numbers begin anew, and hardly anything else."""
+
+    dims: tuple[int, ...]
+    begin: float
+
+    def coordinates(self, x: Array) -> Array:
+        return (columns(x, self.dims) - self.begin) % (2.0 * np.pi)
+
+
 IMAGE_BLUR = 0.3
 """Standard deviation of the smoothing of images, in units of their side."""
 
@@ -107,6 +121,11 @@ def factors_of(
         Periodic(dims) if angles.issuperset(dims) else SquaredExponential(dims)
         for dims in sorted(parts)
     )
+
+
+def cut_factors(angles: Sequence[int], begins: Sequence[float]) -> tuple[CutAngle, ...]:
+    """One factor for each column of angles, cut where its numbers begin."""
+    return tuple(CutAngle((i,), float(begin)) for i, begin in zip(angles, begins, strict=True))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ Approximation = Literal["auto", "exact", "pivoted", "uniform", "fourier"]
 Features = Literal["rkhs", "grid"]
 Restarts = Literal["independent", "stratified"]
 PolicyFit = Literal["map", "bounded"]
+Angles = Literal["cut", "round"]
 Exploration = Literal["bang-bang", "gaussian", "pink"]
 
 
@@ -126,6 +127,9 @@ class Settings(OnPolicySettings):
             from the average reward to the best one that it is thought to earn, step after step
             until the restart.  It falls to 0.35 of itself at each update.  0.1 leads out of a local
             optimum that the first roll-outs show nothing beyond; 0 leaves it out.
+        angles: for V and for the reward that a model expects: ``"cut"`` where their numbers begin
+            anew, as a reward of the number may jump there, or ``"round"``, as for the dynamics and
+            the policy.  On a grid they are round.
         model: transition model: ``"dynamics"`` regresses how the state changes, after a linear
             trend, and takes the features of V where that leads; ``"change"`` embeds how the
             features change, so that far from the data the state stays; ``"embedding"`` embeds the
@@ -154,6 +158,7 @@ class Settings(OnPolicySettings):
     imagined_rollouts: float = 0.5
     judging_rollouts: int = 50
     optimism: float = 0.1
+    angles: Angles = "cut"
     model: Model = "dynamics"
     features: Features = "rkhs"
     grid_size: int = 10
@@ -168,6 +173,7 @@ class Settings(OnPolicySettings):
         self._choose("model", Model)
         self._choose("features", Features)
         self._choose("policy_fit", PolicyFit)
+        self._choose("angles", Angles)
         self._choose("approximation", Approximation)
         self._positive("kl_bound", "basis_tolerance")
         if self.ridge is not None:
@@ -281,6 +287,7 @@ OBSERVED = Settings(
     ridge=0.1,
     exploring_starts=0.0,
     imagined=0,
+    angles="round",
     model="change",
 )
 

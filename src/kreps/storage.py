@@ -24,7 +24,7 @@ from kreps.arrays import FloatArray, IntArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window, is_sane
 from kreps.dataset import Dataset
 from kreps.errors import KrepsError, StorageError
-from kreps.kernels import Kernel
+from kreps.kernels import CutAngle, Kernel, cut_factors
 from kreps.policies import MAX_SUPPORT, CostSensitiveGP, LearntPolicy
 from kreps.settings import AnySettings, LearnerSettings
 from kreps.sparse_gp import SparseGP
@@ -63,6 +63,7 @@ CHECKPOINT_ARRAYS = (
     | ROLLOUT_ARRAYS
     | {
         "value.lengthscales",
+        "value.cuts",
         "value.centres",
         "value.alpha",
         "value.frequencies",
@@ -81,6 +82,7 @@ ADDED_LATER: dict[str, dict[str, Any]] = {
         "judging_rollouts": 0,
         "restarts": "independent",
         "optimism": 0.0,
+        "angles": "round",
     }
 }
 """Settings by method that earlier checkpoints have not, at the values that mean what these did.
@@ -271,10 +273,11 @@ def _task_of(header: Header) -> TaskSpec:
     )
 
 
-def _state_kernel(task: TaskSpec, lengthscales: FloatArray) -> Kernel:
+def _state_kernel(task: TaskSpec, lengthscales: FloatArray, cuts: Sequence[float] = ()) -> Kernel:
     if not ((lengthscales > 1e-50) & (lengthscales < 1e50)).all():
         raise StorageError(f"lengthscales {lengthscales} are not all between 1e-50 and 1e50")
-    return Kernel(task.state_factors, lengthscales)
+    cut = cut_factors(task.periodic, cuts) if len(cuts) else ()
+    return Kernel((*task.state_factors, *cut), lengthscales)
 
 
 def _process_parts(policy: CostSensitiveGP) -> Tensors:
@@ -462,6 +465,9 @@ def _policy_of(tensors: Tensors, task: TaskSpec, kind: str) -> LearntPolicy:
 
 def _value_parts(value: LinearFunction) -> Tensors:
     common = {"value.lengthscales": value.kernel.lengthscales}
+    cuts = [factor.begin for factor in value.kernel.factors if isinstance(factor, CutAngle)]
+    if cuts:
+        common["value.cuts"] = np.array(cuts)
     if isinstance(value, FourierExpansion):
         return common | {"value.frequencies": value.frequencies, "value.theta": value.theta}
     assert isinstance(value, KernelExpansion)
@@ -475,13 +481,16 @@ def _value_of(tensors: Tensors, task: TaskSpec) -> LinearFunction:
         if fourier
         else {"value.centres": ("r", "ds"), "value.alpha": ("r",)}
     )
+    cuts: Sequence[float] = ()
+    if "value.cuts" in tensors:
+        cuts = _take(tensors, {"value.cuts": (len(task.periodic),)})["value.cuts"].tolist()
     t = _take(
         tensors,
         {"value.lengthscales": ("factors",), **shapes},
-        factors=task.factor_count,
+        factors=task.factor_count + len(cuts),
         ds=task.observation_size,
     )
-    kernel = _state_kernel(task, t["value.lengthscales"])
+    kernel = _state_kernel(task, t["value.lengthscales"], cuts)
     if not fourier:
         return KernelExpansion(kernel, t["value.centres"], t["value.alpha"])
     value = FourierExpansion(kernel, t["value.frequencies"], t["value.theta"])
@@ -695,6 +704,7 @@ def load_checkpoint(
             rollouts = _rollouts_of(tensors, task.observation_size, task.action_size)
             window = window.extend(rollouts)
         learnt, g = iteration > 0, task.factor_count
+        cuts = len(tensors.get("value.cuts", ()))  # the reward's kernel has those that V's has
         if learnt and header["policy"] not in POLICIES_OF_METHOD[method]:
             raise StorageError(f"it holds a policy that {method} does not learn")
         state = LearnerState(
@@ -705,7 +715,7 @@ def load_checkpoint(
             policy=_policy_of(tensors, task, header["policy"]) if learnt else None,
             value=_value_of(tensors, task) if learnt and method == "reps" else None,
             embedding_start=_start_of(tensors, "start.embedding", g + task.action_size + 1),
-            reward_start=_start_of(tensors, "start.reward", g + task.action_size + 1),
+            reward_start=_start_of(tensors, "start.reward", g + cuts + task.action_size + 1),
             policy_start=_start_of(tensors, "start.policy", g + 2),
         )
     except (KrepsError, KeyError, TypeError, ValueError, OverflowError) as error:

@@ -54,6 +54,7 @@ from kreps.algorithms.transition_model import (
     restart_features,
     state_actions,
     state_kernel,
+    with_cuts,
 )
 from kreps.arrays import FloatArray, IntArray, as_float
 from kreps.compute import Compute
@@ -122,10 +123,11 @@ def update(
 
     # Eq. 3: a basis of V, chosen among the sampled states
     kernel = state_kernel(sample, task, rng)
+    cut_kernel = with_cuts(kernel, sample, task, settings)
     if settings.features == "grid":
         basis: Basis = RBFGrid.over(kernel.factors, sample.points, settings.grid_size)[0]
     else:
-        basis = choose_basis(kernel, sample.points, settings, settings.max_rank, rng)
+        basis = choose_basis(cut_kernel, sample.points, settings, settings.max_rank, rng)
     place = compute.to_device
     starts = reduce(add, compute.map(StartFeatures(basis, place), dataset.chunks))
     count = int(starts[-1])
@@ -204,7 +206,7 @@ def update(
         inputs = state_actions(sample, task)
         targets = (rewards[sampled] - rewards[sampled].mean())[:, None]
         reward_kernel, regulariser, reward_start = embedding_hyperparameters(
-            inputs, targets, kernel, task, reward_start, rng, REWARD_TOLERANCE
+            inputs, targets, cut_kernel, task, reward_start, rng, REWARD_TOLERANCE
         )
         embedded = choose_basis(reward_kernel, inputs, settings, settings.rank, rng)
         bases.append(embedded)

@@ -25,6 +25,7 @@ from kreps.algorithms.transition_model import (
     restart_features,
     state_kernel,
     successor_features,
+    with_cuts,
 )
 from kreps.arrays import FloatArray, IntArray
 from kreps.data import Rollout, TaskSpec, Transitions, Window
@@ -149,7 +150,8 @@ def update(
 
     # Eq. 3: a basis of V, chosen among the sampled states
     kernel = state_kernel(data, task, rng)
-    basis, features = value_basis(data, kernel, settings)
+    cut_kernel = with_cuts(kernel, data, task, settings)
+    basis, features = value_basis(data, cut_kernel, settings)
     clock.lap("basis")
 
     # Eq. 4: expected features of each successor
@@ -195,7 +197,7 @@ def update(
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
         targets = (rewards - rewards.mean())[:, None]
         regression, reward_start = fit_regression(
-            data, targets, kernel, task, reward_start, rng, REWARD_TOLERANCE
+            data, targets, cut_kernel, task, reward_start, rng, REWARD_TOLERANCE
         )
         jitters.append(regression.factor.jitter)
         outlook = Outlook(

@@ -11,7 +11,7 @@ from kreps.arrays import FloatArray, IntArray
 from kreps.data import TaskSpec, Transitions
 from kreps.embedding import KernelEmbedding, PivotedEmbedding
 from kreps.hyperparameters import TOLERANCE, EmbeddingLoss, Prior, factor_distances, minimise
-from kreps.kernels import Kernel, SquaredExponential, median_lengthscales
+from kreps.kernels import Kernel, SquaredExponential, cut_factors, median_lengthscales
 from kreps.settings import Settings
 
 FIT_SAMPLE = 300
@@ -20,6 +20,14 @@ FIT_SAMPLE = 300
 REWARD_TOLERANCE = 1e-5
 """Of the reward's fit.  Where a goal is seldom reached it is a small part of the error, and a fit
 that ends early has not found it yet."""
+
+
+CUT_LENGTHSCALE = np.pi
+"""Of the numbers of angles in V's kernel, rad: a turn apart, states are ``exp(-2)`` alike, so that
+V can jump there, and little is lost where it need not."""
+
+UNCUT_LENGTHSCALE = 1e6
+"""The same, rad, where angles count their turns: all of one turn are alike."""
 
 
 def random_rows(n: int, rng: np.random.Generator) -> IntArray:
@@ -33,6 +41,29 @@ def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) ->
     """The kernel over states at the median lengthscales."""
     factors = task.state_factors
     return Kernel(factors, median_lengthscales(factors, data.points, rng))
+
+
+def with_cuts(kernel: Kernel, data: Transitions, task: TaskSpec, settings: Settings) -> Kernel:
+    """The kernel over states of what may jump where the numbers of an angle begin anew.
+
+    A reward often comes from the number, as ``-theta^2`` does, and jumps from one end of a turn to
+    the other; so does V, which has it in it.  What moves does not, nor does a good action.
+
+    Args:
+        kernel: over states, at V's lengthscales.
+        data: tells where the cut is: within the gap that its angles leave of a turn.  An angle that
+            counts its turns has none.
+        task: which coordinates are angles.
+        settings: ``angles``; nothing is changed where they are round.
+    """
+    if settings.angles == "round" or settings.features == "grid":
+        return kernel
+    angles = data.points[:, list(task.periodic)]
+    low, high = angles.min(axis=0), angles.max(axis=0)
+    begins = 0.5 * (low + high) - np.pi
+    lengthscales = np.where(high - low <= 2.0 * np.pi, CUT_LENGTHSCALE, UNCUT_LENGTHSCALE)
+    cuts = cut_factors(task.periodic, begins)
+    return Kernel((*kernel.factors, *cuts), np.append(kernel.lengthscales, lengthscales))
 
 
 def successor_features(data: Transitions, features: FloatArray) -> FloatArray:

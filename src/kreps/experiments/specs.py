@@ -122,6 +122,7 @@ ABLATIONS: dict[str, Options] = {
     "half the KL bound": {"kl_bound": 0.5},
     "independent restarts": {"restarts": "independent"},
     "no optimism": {"optimism": 0.0},
+    "round angles": {"angles": "round"},
     "hard ranges": {"policy_fit": "bounded"},
     "changes of features embedded": {"model": "change"},
     "successor embedded": {"model": "embedding"},
@@ -164,7 +165,7 @@ BEYOND: dict[str, tuple[Curve, ...]] = {
     "ablation": tuple(("swing-up", m) for m in (DEFAULT, *ABLATIONS)),
 }
 """Experiments that are not among the paper's: run by name, not by ``all``."""
-FIRST_SEED = {"untuned": 1190, "ablation": 1190}
+FIRST_SEED = {"untuned": 1200, "ablation": 1200}
 """Of experiments that confirm what was found on others; 0 elsewhere."""
 PICTURES = ("figure-2a",)
 """Figures without an experiment: the features of the images."""
