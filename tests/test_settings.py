@@ -33,6 +33,7 @@ def test_the_default_recipe_asks_the_model_for_more_than_the_observed_one() -> N
         "exploring_starts": 0.0,
         "model": "change",
         "restarts": "independent",
+        "angles": "round",
     }
     assert settings_of("default", **own) == settings_of("observed")
 

@@ -1,0 +1,132 @@
+"""Angles by their numbers: where the turn is cut, and what may jump there."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+import kreps
+from kreps.algorithms.transition_model import (
+    CUT_LENGTHSCALE,
+    fit_regression,
+    state_actions,
+    state_kernel,
+    with_cuts,
+)
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec, Transitions
+from kreps.kernels import CutAngle, Kernel, Periodic
+
+TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]), periodic=(0,))
+TURN = 2.0 * np.pi
+
+
+def turning(begin: float, samples: int = 400, turns: float = 1.0) -> Transitions:
+    """Angles spread over turns from ``begin`` on; the reward is minus their square."""
+    rng = np.random.default_rng(0)
+    angles = begin + turns * TURN * rng.permutation(samples + 1) / (samples + 1)
+    states = np.column_stack([angles, rng.normal(size=samples + 1)])
+    rewards = -(states[:-1, 0] ** 2)
+    return Transitions.of([Rollout(states, rng.uniform(-1, 1, (samples, 1)), rewards)])
+
+
+def kernels_of(data: Transitions, settings: kreps.Settings) -> tuple[Kernel, Kernel]:
+    kernel = state_kernel(data, TASK, np.random.default_rng(0))
+    return kernel, with_cuts(kernel, data, TASK, settings)
+
+
+@pytest.mark.parametrize("begin", [-np.pi, -0.5 * np.pi, 0.0, 4.0])
+def test_the_cut_lies_in_the_gap_that_the_angles_leave(begin: float) -> None:
+    kernel, cut = kernels_of(turning(begin), kreps.Settings())
+    factor = cut.factors[-1]
+    assert isinstance(factor, CutAngle) and factor.dims == (0,)
+    assert abs(factor.begin - begin) <= TURN / 401
+    sides = begin + np.array([[-0.1, 0.0], [0.1, 0.0]])
+    inside = sides + np.array([1.0, 0.0])
+    alike = kernel.gram(sides[:1], sides[1:])[0, 0]
+    assert kernel.gram(inside[:1], inside[1:])[0, 0] == pytest.approx(alike)
+    # across the cut they are nearly a turn apart, elsewhere as near as before
+    apart = np.exp(-0.5 * ((TURN - 0.2) / CUT_LENGTHSCALE) ** 2)
+    assert cut.gram(sides[:1], sides[1:])[0, 0] == pytest.approx(alike * apart)
+    assert cut.gram(inside[:1], inside[1:])[0, 0] == pytest.approx(alike, rel=0.01)
+    # whole turns are not felt: roll-outs in the model do not come back into the range
+    np.testing.assert_allclose(cut.gram(sides + np.array([3 * TURN, 0.0]), sides), cut.gram(sides))
+
+
+def test_angles_that_count_their_turns_are_not_cut() -> None:
+    kernel, cut = kernels_of(turning(0.3, turns=1.7), kreps.Settings())
+    states = np.column_stack([np.linspace(-9.0, 9.0, 50), np.zeros(50)])
+    np.testing.assert_allclose(cut.gram(states), kernel.gram(states), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [kreps.Settings(angles="round"), kreps.Settings(features="grid")],
+    ids=["round", "grid"],
+)
+def test_nothing_is_cut_where_it_is_not_asked_for(settings: kreps.Settings) -> None:
+    kernel, cut = kernels_of(turning(0.0), settings)
+    assert cut is kernel
+
+
+def test_the_recipe_of_the_paper_is_round() -> None:
+    learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), recipe="paper", initial_rollouts=5)
+    value = learner.learn(1, progress=False).state.value
+    assert value is not None
+    assert [type(factor) for factor in value.kernel.factors[:1]] == [Periodic]
+    assert not any(isinstance(factor, CutAngle) for factor in value.kernel.factors)
+
+
+def largest_miss(data: Transitions, kernel: Kernel, around: FloatArray) -> float:
+    """Of the reward's regression, beside its own samples."""
+    targets = (data.rewards - data.rewards.mean())[:, None]
+    rng = np.random.default_rng(0)
+    regression, _ = fit_regression(data, targets, kernel, TASK, None, rng, 1e-5)
+    inputs = np.column_stack([around, np.zeros(len(around)), np.zeros(len(around))])
+    assert inputs.shape[1] == state_actions(data, TASK).shape[1]
+    said = data.rewards.mean() + regression.predictor(targets)(inputs)[:, 0]
+    return float(np.abs(said + around**2).max())
+
+
+def test_a_reward_of_the_number_is_learnt_up_to_the_cut() -> None:
+    data = turning(-0.5 * np.pi)
+    kernel, cut = kernels_of(data, kreps.Settings())
+    beside = np.array([-0.5 * np.pi + 0.05, 1.5 * np.pi - 0.05])
+    assert largest_miss(data, kernel, beside) > 1.0
+    assert largest_miss(data, cut, beside) < 0.05
+
+
+def test_a_reward_that_is_round_loses_nothing() -> None:
+    data = turning(-np.pi)
+    round_reward = Transitions(**{**vars(data), "rewards": np.cos(data.states[:, 0])})
+    targets = (round_reward.rewards - round_reward.rewards.mean())[:, None]
+    around = np.linspace(-np.pi, np.pi, 60)
+    inputs = np.column_stack([around, np.zeros(60), np.zeros(60)])
+    for kernel in kernels_of(data, kreps.Settings()):
+        rng = np.random.default_rng(0)
+        regression, _ = fit_regression(round_reward, targets, kernel, TASK, None, rng, 1e-5)
+        said = round_reward.rewards.mean() + regression.predictor(targets)(inputs)[:, 0]
+        assert np.abs(said - np.cos(around)).max() < 0.01
+
+
+@pytest.mark.parametrize("approximation", ["exact", "pivoted", "fourier"])
+def test_the_value_function_jumps_with_the_reward_and_survives_a_checkpoint(
+    approximation: str, tmp_path: Path
+) -> None:
+    env = gym.make("kreps/SwingUp-v0")
+    jumps = {}
+    for angles in ("cut", "round"):
+        learner = kreps.KREPS(env, seed=1, angles=angles, approximation=approximation)
+        learner.learn(2, progress=False)
+        sides = np.array([[1.5 * np.pi - 0.01, 8.0], [-0.5 * np.pi + 0.01, 8.0]])
+        low, high = learner.value_function(sides)
+        jumps[angles] = high - low
+        learner.save(tmp_path / angles)
+        again = kreps.KREPS.resume(tmp_path / angles, env)
+        np.testing.assert_array_equal(again.value_function(sides), [low, high])
+        assert again.learn(1, progress=False).state.iteration == 3
+    # the reward does by 10 ((3 pi / 2)^2 - (pi / 2)^2), 197
+    assert jumps["cut"] > 100.0 > 10.0 * abs(jumps["round"])
