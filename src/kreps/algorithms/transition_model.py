@@ -52,7 +52,7 @@ def with_cuts(kernel: Kernel, data: Transitions, task: TaskSpec, settings: Setti
     Args:
         kernel: over states, at V's lengthscales.
         data: tells where the cut is: within the gap that its angles leave of a turn.  An angle that
-            counts its turns has none.
+            counts its turns has none, unless a fit of the lengthscales finds one of use.
         task: which coordinates are angles.
         settings: ``angles``; nothing is changed where they are round.
     """
