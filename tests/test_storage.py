@@ -671,6 +671,8 @@ def test_every_array_is_needed_in_its_shape(good: Good, tmp_path: Path) -> None:
             assert missed in good.refused_with(path, others, {**header, "arrays": sorted(others)})
         wide = np.concatenate([values, values], axis=-1)
         for wrong in (wide, values[:-1], values[None], values.ravel()[:0], np.float64(1.0)):
+            if np.atleast_1d(wrong).shape == values.shape:  # so it is written
+                continue
             message = good.refused_with(path, {**others, name: wrong})
             assert any(said in message for said in ("shape", "do not fit", "no support point"))
 
@@ -785,7 +787,7 @@ def _task(observation_size: Any = 2, **changes: Any) -> dict[str, Any]:
         "observation_size": observation_size,
         "action_low": [-1.0],
         "action_high": [1.0],
-        "periodic": [],
+        "periodic": [0],
         "groups": [],
         "image_shape": None,
     }
@@ -939,7 +941,13 @@ def test_checkpoints_of_before_a_setting_was_there_keep_their_meaning(
     }
     for name in set(later) - set(changes):
         del settings[name]
-    path = forge(tmp_path / "old", file.tensors, {**file.header, "settings": settings})
+    tensors = dict(file.tensors)  # nothing was cut then
+    del tensors["value.cuts"]
+    for name in ("value.lengthscales", "start.reward"):
+        if name in tensors:
+            tensors[name] = np.delete(tensors[name], 2)
+    header = {**file.header, "settings": settings, "arrays": sorted(tensors)}
+    path = forge(tmp_path / "old", tensors, header)
     learner = kreps.KREPS.resume(path, gym.make("kreps/SwingUp-v0"))
     assert {name: getattr(learner.settings, name) for name in later} == {
         **later,
