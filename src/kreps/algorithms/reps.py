@@ -79,7 +79,7 @@ class UpdateInfo:
         dual: the last step's solution with its certificate.
         effective_samples: effective sample size of the weights.
         support: support points of the policy.
-        state_lengthscales: of V's kernel.
+        state_lengthscales: of V's kernel, but for cuts of angles.
         embedding_parameters, policy_parameters: fitted values (not logs): lengthscales, then
             lambda, or sf2 and l.  The former are those of the transition model, whichever it is.
             After widened imagined steps the policy has its sf2 and noise divided.
