@@ -25,6 +25,7 @@ from kreps.dual import Moments
 from kreps.embedding import FeatureRegression, KernelEmbedding, RegressionSums, SampleModel
 from kreps.errors import NumericalError
 from kreps.kernels import (
+    CutAngle,
     Factor,
     Kernel,
     Periodic,
@@ -107,7 +108,12 @@ def test_rows_and_columns_are_taken_in_any_order_and_twice() -> None:
 
 @pytest.mark.parametrize(
     "factor",
-    [SquaredExponential((0, 2)), Periodic((1,)), SmoothedImage(tuple(range(12)), (3, 4))],
+    [
+        SquaredExponential((0, 2)),
+        Periodic((1,)),
+        CutAngle((1,), 0.5),
+        SmoothedImage(tuple(range(12)), (3, 4)),
+    ],
     ids=lambda factor: type(factor).__name__,
 )
 def test_factors_have_the_same_coordinates(factor: Factor) -> None:

@@ -59,7 +59,8 @@ class CutAngle:
     """``exp(-|x - y|^2 / (2 l^2))`` of an angle by its number, from ``begin`` to a turn later.
 
     Beside a periodic factor of the same angle it tells the two sides of the cut apart, where the
-    numbers begin anew, and hardly anything else."""
+    numbers begin anew, and hardly anything else.
+    """
 
     dims: tuple[int, ...]
     begin: float

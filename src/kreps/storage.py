@@ -276,7 +276,7 @@ def _task_of(header: Header) -> TaskSpec:
 def _state_kernel(task: TaskSpec, lengthscales: FloatArray, cuts: Sequence[float] = ()) -> Kernel:
     if not ((lengthscales > 1e-50) & (lengthscales < 1e50)).all():
         raise StorageError(f"lengthscales {lengthscales} are not all between 1e-50 and 1e50")
-    cut = cut_factors(task.periodic, cuts) if len(cuts) else ()
+    cut = cut_factors(task.periodic[: len(cuts)], cuts)  # all of them, or none
     return Kernel((*task.state_factors, *cut), lengthscales)
 
 
@@ -704,7 +704,7 @@ def load_checkpoint(
             rollouts = _rollouts_of(tensors, task.observation_size, task.action_size)
             window = window.extend(rollouts)
         learnt, g = iteration > 0, task.factor_count
-        cuts = len(tensors.get("value.cuts", ()))  # the reward's kernel has those that V's has
+        cut_count = len(tensors.get("value.cuts", ()))  # the reward's kernel has V's cuts
         if learnt and header["policy"] not in POLICIES_OF_METHOD[method]:
             raise StorageError(f"it holds a policy that {method} does not learn")
         state = LearnerState(
@@ -715,7 +715,7 @@ def load_checkpoint(
             policy=_policy_of(tensors, task, header["policy"]) if learnt else None,
             value=_value_of(tensors, task) if learnt and method == "reps" else None,
             embedding_start=_start_of(tensors, "start.embedding", g + task.action_size + 1),
-            reward_start=_start_of(tensors, "start.reward", g + cuts + task.action_size + 1),
+            reward_start=_start_of(tensors, "start.reward", g + cut_count + task.action_size + 1),
             policy_start=_start_of(tensors, "start.policy", g + 2),
         )
     except (KrepsError, KeyError, TypeError, ValueError, OverflowError) as error:
