@@ -57,7 +57,8 @@ def bench_embedding_loss(measure: Measure) -> None:
     p = Prepared()
     rows = slice(0, FIT_SAMPLE)
     rank = p.changes.shape[1]
-    loss = EmbeddingLoss(factor_distances(p.input_kernel.factors, p.inputs[rows]), p.changes[rows])
+    distances = factor_distances(p.input_kernel.factors, p.inputs[rows])
+    loss = EmbeddingLoss(distances, p.changes[rows], np.ones(FIT_SAMPLE))
     x = np.append(np.log(p.input_kernel.lengthscales), np.log(1e-3))
     measure(
         "loss of the embedding, with gradient",

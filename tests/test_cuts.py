@@ -12,7 +12,6 @@ import pytest
 import kreps
 from kreps.algorithms.transition_model import (
     CUT_LENGTHSCALE,
-    REWARD_TOLERANCE,
     fit_regression,
     state_actions,
     state_kernel,
@@ -86,7 +85,7 @@ def expected_rewards(data: Transitions, kernel: Kernel, around: FloatArray) -> F
     """Of angles (m,) at rest without an action, by the reward's regression."""
     targets = (data.rewards - data.rewards.mean())[:, None]
     rng = np.random.default_rng(0)
-    regression, _ = fit_regression(data, targets, kernel, TASK, None, rng, REWARD_TOLERANCE)
+    regression, _ = fit_regression(data, targets, kernel, TASK, None, rng)
     inputs = np.column_stack([around, np.zeros((len(around), 2))])
     assert inputs.shape[1] == state_actions(data, TASK).shape[1]
     return data.rewards.mean() + regression.predictor(targets)(inputs)[:, 0]

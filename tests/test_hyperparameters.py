@@ -9,7 +9,6 @@ import pytest
 
 from kreps.arrays import FloatArray
 from kreps.data import TaskSpec
-from kreps.embedding import KernelEmbedding
 from kreps.errors import NumericalError
 from kreps.hyperparameters import EmbeddingLoss, PolicyLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel, Periodic, SquaredExponential
@@ -31,7 +30,9 @@ def embedding_case(n: int, seed: int) -> tuple[EmbeddingLoss, FloatArray, FloatA
     rng = np.random.default_rng(seed + 100)
     features = np.column_stack([np.sin(x[:, 0]), x[:, 1] * x[:, 2], rng.normal(size=n)])
     parameters = np.log([0.7, 1.3, 2.5, 0.05])
-    return EmbeddingLoss(factor_distances(FACTORS, x), features), x, parameters
+    weights = rng.uniform(0.5, 5.0, n)
+    weights /= weights.mean()
+    return EmbeddingLoss(factor_distances(FACTORS, x), features, weights), x, parameters
 
 
 def policy_case(n: int, seed: int, actions: int) -> tuple[PolicyLoss, FloatArray, FloatArray]:
@@ -76,14 +77,15 @@ def test_embedding_errors_equal_those_of_refits_without_each_sample() -> None:
     loss, x, parameters = embedding_case(20, 3)
     kernel = Kernel(FACTORS, np.exp(parameters[:-1]))
     wanted = []
+    noise = np.exp(parameters[-1]) / loss.weights
     for i in range(20):
         rest = np.arange(20) != i
-        model = KernelEmbedding.fit(kernel, x[rest], float(np.exp(parameters[-1])))
-        prediction = model.strengths(x[i : i + 1]).T @ loss.features[rest]
-        wanted.append(loss.features[i] - prediction[0])
+        matrix = kernel.gram(x[rest]) + np.diag(noise[rest])
+        k = kernel.gram(x[rest], x[i : i + 1])[:, 0]
+        wanted.append(loss.features[i] - k @ np.linalg.solve(matrix, loss.features[rest]))
     np.testing.assert_allclose(loss.errors(parameters), wanted, atol=1e-10)
     value, _ = loss(parameters)
-    mean_square = np.mean(np.sum(np.square(wanted), axis=1))
+    mean_square = np.mean(loss.weights * np.sum(np.square(wanted), axis=1))
     assert value == pytest.approx(np.log(mean_square), rel=1e-9)
 
 
@@ -204,7 +206,7 @@ def test_the_search_recovers_the_lengthscale_of_smooth_data() -> None:
     x = inputs(80, 7)
     features = np.column_stack([np.cos(3.0 * x[:, 0]), np.sin(3.0 * x[:, 0])])
     features += 0.05 * rng.normal(size=features.shape)
-    loss = EmbeddingLoss(factor_distances(FACTORS, x), features)
+    loss = EmbeddingLoss(factor_distances(FACTORS, x), features, np.ones(len(x)))
     start = np.log([1.0, 1.0, 3.0, 1e-2])
     found = minimise(loss, box(start, 3.0), start, max_iterations=100)
     assert loss(found)[0] < np.log(0.05)

@@ -217,7 +217,8 @@ def test_the_error_falls_as_the_rank_grows(variant: str, rollouts: list[Rollout]
         policies.append(float(np.abs(moments(found, states) - moments(exact, states)).max()))
     # Measured with "change": 0.7, 0.2, 0.07 and 4e-5; 1.6, 0.9, 0.08 and 1e-5.
     assert weights[0] > 2.0 * weights[1] > 4.0 * weights[2] > 100.0 * weights[3]
-    assert policies[0] > policies[1] > 2.0 * policies[2] > 100.0 * policies[3]
+    # the largest difference of two policies need not fall with every feature, but in the end
+    assert policies[0] == max(policies) and min(policies[:3]) > 100.0 * policies[3]
 
 
 def test_the_basis_of_v_alone_decides_the_rank_and_the_residual(rollouts: list[Rollout]) -> None:

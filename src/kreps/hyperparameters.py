@@ -15,24 +15,27 @@ from scipy.optimize import minimize
 from kreps.arrays import FloatArray
 from kreps.errors import NumericalError
 from kreps.kernels import Factor, squared_distances
-from kreps.linalg import cholesky
+from kreps.linalg import cholesky, with_diagonal
 
 
 @dataclass(frozen=True)
 class EmbeddingLoss:
     """Leave-one-out error of the conditional embedding as a predictor of features.
 
-    ``log mean_i |e_i|^2`` with ``e_i = [C^-1 F']_i / [C^-1]_ii`` and ``C = K_sa + lambda I``:
-    the i-th successor's features less their prediction from all other samples.  Parameters:
-    g log lengthscales, then log lambda.
+    ``log mean_i w_i |e_i|^2`` with ``e_i = [C^-1 F']_i / [C^-1]_ii`` and
+    ``C = K_sa + lambda diag(1 / w_i)``: the i-th successor's features less their prediction from
+    all other samples.  Weights count in both: a kind of sample that was chosen more often than
+    others would else be expected more often.  Parameters: g log lengthscales, then log lambda.
 
     Attributes:
         distances: (g, m, m) squared distances of each factor at lengthscale one.
         features: (m, r) successor features F'.
+        weights: (m,) the w_i, one on average: in which proportion these stand for all samples.
     """
 
     distances: FloatArray
     features: FloatArray
+    weights: FloatArray
 
     def errors(self, x: FloatArray) -> FloatArray:
         """``e``, (m, r), at parameters ``x`` (g + 1,)."""
@@ -44,7 +47,7 @@ class EmbeddingLoss:
         return np.exp(-0.5 * np.tensordot(inverse_squares, self.distances, 1)), float(np.exp(x[-1]))
 
     def _inverse(self, gram: FloatArray, regulariser: float) -> FloatArray:
-        return cholesky(gram + regulariser * np.eye(len(gram))).inverse()
+        return cholesky(with_diagonal(gram, regulariser / self.weights)).inverse()
 
     def __call__(self, x: FloatArray) -> tuple[float, FloatArray]:
         """Value and gradient (g + 1,)."""
@@ -53,18 +56,19 @@ class EmbeddingLoss:
         d = np.diagonal(inverse)
         a = inverse @ self.features
         e = a / d[:, None]
-        squares = np.einsum("ij,ij->i", e, e)
+        share = self.weights / len(d)
+        squares = share * np.einsum("ij,ij->i", e, e)
         total = max(float(squares.sum()), 1e-200)  # nothing to predict: a state that never moves
         # d total = 2 <dC, M>: de_i = -[C^-1 dC a]_i / d_i + e_i [C^-1 dC C^-1]_ii / d_i
         half = inverse * np.sqrt(squares / d)
-        m = half @ half.T - a @ ((e / d[:, None]).T @ inverse)
+        m = half @ half.T - a @ ((e * (share / d)[:, None]).T @ inverse)
         weighted = m * gram
         gradient = [
             2.0 * np.einsum("ij,ij->", weighted, distance) * np.exp(-2.0 * log_l)
             for distance, log_l in zip(self.distances, x[:-1], strict=True)
         ]
-        gradient.append(2.0 * regulariser * float(np.trace(m)))
-        return float(np.log(total / len(d))), np.array(gradient) / total
+        gradient.append(2.0 * regulariser * float(np.sum(np.diagonal(m) / self.weights)))
+        return float(np.log(total)), np.array(gradient) / total
 
 
 @dataclass(frozen=True)
@@ -154,11 +158,18 @@ the losses are logarithms, and some hundred samples do not tell less apart."""
 def minimise(
     loss: EmbeddingLoss | PolicyLoss,
     prior: Prior,
-    start: FloatArray,
+    *starts: FloatArray,
     max_iterations: int = 30,
-    tolerance: float = TOLERANCE,
 ) -> FloatArray:
-    """Parameters of least loss plus prior within the prior's box, from ``start`` (L-BFGS-B)."""
+    """Parameters of least loss plus prior within the prior's box (L-BFGS-B).
+
+    Args:
+        loss, prior: add up to what is minimised.
+        starts: one or more; the search begins at the best of them.  Where all samples are taken to
+            be unlike each other nothing is predicted and nothing improves, and a search that has
+            once come there would stay.
+        max_iterations: of the search.
+    """
 
     def objective(x: Any) -> tuple[float, Any]:
         try:
@@ -168,12 +179,14 @@ def minimise(
         penalty, pull = prior(x)
         return value + penalty, gradient + pull
 
+    inside = [np.clip(start, prior.low, prior.high) for start in starts]
+    best = min(inside, key=lambda x: objective(x)[0]) if len(inside) > 1 else inside[0]
     found = minimize(
         objective,
-        np.clip(start, prior.low, prior.high),
+        best,
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(prior.low, prior.high, strict=True)),
-        options={"maxiter": max_iterations, "ftol": tolerance},
+        options={"maxiter": max_iterations, "ftol": TOLERANCE},
     )
     return np.asarray(found.x, dtype=np.float64)

@@ -152,12 +152,14 @@ class Dynamics:
         states = inputs[:, : self.residuals.shape[1]]
         return states + self.motion.changes(targets), np.clip(targets[:, -1:], 0.0, 1.0)
 
-    def draw(
-        self, rows: IntArray, inputs: FloatArray, rng: np.random.Generator
+    def drawn(
+        self, rows: IntArray, inputs: FloatArray, sides: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """One successor (m, ds) each, with the noise of samples (m,); and shares of ends (m,)."""
+        """One successor (m, ds) each, with the noise of samples (m,); and shares of ends (m,).
+
+        To which sides (m, 1), plus or minus one, is for the caller to draw.
+        """
         successors, ends = self.predicted(inputs)
-        sides = rng.choice([-1.0, 1.0], size=(len(rows), 1))
         return successors + sides * self.residuals[rows], ends[:, 0]
 
     def expected_features(

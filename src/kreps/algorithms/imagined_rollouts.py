@@ -8,7 +8,7 @@ foretold before it acts: see `kreps.algorithms.judgement`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
@@ -77,6 +77,32 @@ def average_reward(rewards: FloatArray, restart_probability: float) -> FloatArra
 
 
 @dataclass(frozen=True)
+class Chance:
+    """What is drawn for one step of m roll-outs, whatever the policy.
+
+    Attributes:
+        noise: (m, da) standard normal, of the actions.
+        sides: (m, 1) one or minus one: to which side a residual is added.
+        ends: (m,) uniform; the task ends where its chance to is larger.
+    """
+
+    noise: FloatArray
+    sides: FloatArray
+    ends: FloatArray
+
+    @classmethod
+    def of(cls, count: int, action_size: int, rng: np.random.Generator) -> Chance:
+        noise = rng.standard_normal((count, action_size))
+        sides = np.where(rng.integers(2, size=(count, 1)) == 0, 1.0, -1.0)
+        return cls(noise, sides, rng.uniform(size=count))
+
+    def repeated(self, times: int) -> Chance:
+        """The same for each of so many policies."""
+        noise, sides = (np.tile(each, (times, 1)) for each in (self.noise, self.sides))
+        return Chance(noise, sides, np.tile(self.ends, times))
+
+
+@dataclass(frozen=True)
 class Simulator:
     """The restarting process, as learnt from n samples.
 
@@ -115,7 +141,8 @@ class Simulator:
         visited, nearest = [], []
         states = self._starts(len(left), rng)
         while len(states):
-            rows, _, _, successors, ended = self._step(policy, states, rng)
+            chance = Chance.of(len(states), self.task.action_size, rng)
+            rows, _, _, successors, ended = self._step(policy.act, states, chance)
             visited.append(states)
             nearest.append(rows)
             left = np.where(ended, 0, left - 1)
@@ -124,36 +151,52 @@ class Simulator:
 
     def follow(
         self,
-        policy: StochasticPolicy,
+        policies: Sequence[StochasticPolicy],
         reward: Callable[[FloatArray], FloatArray],
         count: int,
         rng: np.random.Generator,
-    ) -> Followed:
-        """A policy from so many starts, without random restarts.
+    ) -> list[Followed]:
+        """Each policy from so many starts, without random restarts.
 
-        What is drawn does not depend on the policy: from copies of one generator two of them meet
-        the same chance.
+        They are followed side by side, and meet the same chance: starts, noise and ends.
 
         Args:
-            policy: to be followed, with its noise.
+            policies: to be followed, each with its noise.
             reward: of states and scaled, applied actions (m, ds + da).
             count: of the starts.
-            rng: of starts, noise and ends.
+            rng: of the chance.
         """
+        many = len(policies)
         steps = min(ceil(AVERAGED / self.restart_probability), self.longest)
+
+        def act(states: FloatArray, noise: FloatArray) -> FloatArray:
+            parts = zip(policies, np.split(states, many), np.split(noise, many), strict=True)
+            return np.concatenate([policy.act(*part) for policy, *part in parts])
+
         asked, likeness, ends = [], [], []
-        states = self._starts(count, rng)
+        states = np.tile(self._starts(count, rng), (many, 1))
         for _ in range(steps):
-            _, alike, inputs, successors, ended = self._step(policy, states, rng)
+            chance = Chance.of(count, self.task.action_size, rng).repeated(many)
+            _, alike, inputs, successors, ended = self._step(act, states, chance)
             asked.append(inputs)
             likeness.append(alike)
             ends.append(ended)
-            states = np.where(ended[:, None], self._starts(count, rng), successors)
-        rewards = reward(np.concatenate(asked)).reshape(steps, count)
-        return Followed(rewards, np.array(likeness), np.array(ends))
+            if ended.any():
+                anew = np.tile(self._starts(count, rng), (many, 1))
+                successors = np.where(ended[:, None], anew, successors)
+            states = successors
+        rewards = reward(np.concatenate(asked))
+        each = (
+            np.split(np.reshape(values, (steps, many * count)), many, axis=1)
+            for values in (rewards, likeness, ends)
+        )
+        return [Followed(*parts) for parts in zip(*each, strict=True)]
 
     def _step(
-        self, policy: StochasticPolicy, states: FloatArray, rng: np.random.Generator
+        self,
+        act: Callable[[FloatArray, FloatArray], FloatArray],
+        states: FloatArray,
+        chance: Chance,
     ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray]:
         """One step from states (m, ds), real ends and random restarts left to the caller.
 
@@ -162,11 +205,10 @@ class Simulator:
         (m,).
         """
         rows, likeness = self.nearest(states)
-        noise = rng.standard_normal((len(states), self.task.action_size))
-        actions = self.task.scaled(self.task.clip(policy.act(states, noise)))
+        actions = self.task.scaled(self.task.clip(act(states, chance.noise)))
         inputs = np.concatenate([states, actions], axis=1)
-        successors, ends = self.dynamics.draw(rows, inputs, rng)
-        ended = rng.uniform(size=len(ends)) < ends
+        successors, ends = self.dynamics.drawn(rows, inputs, chance.sides)
+        ended = chance.ends < ends
         return rows, likeness, inputs, np.clip(successors, *self._range), ended
 
     @cached_property
@@ -201,6 +243,8 @@ class Simulator:
 
     def _starts(self, count: int, rng: np.random.Generator) -> FloatArray:
         starts = self.data.points[rng.choice(self.data.start, count)]
+        if not self.exploring_starts:
+            return starts
         anywhere = self.data.points[rng.choice(self.data.state, count)]
         return np.where(rng.uniform(size=(count, 1)) < self.exploring_starts, anywhere, starts)
 

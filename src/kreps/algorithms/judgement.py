@@ -14,7 +14,6 @@ Only while there is optimism (`kreps.algorithms.optimism`) the judge shares it.
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -41,7 +40,7 @@ def refuses(
         new, before: with their noise; None before the first update.
         outlook: what the model says.
         settings: ``judging_rollouts`` of each policy.
-        rng: of the roll-outs; it is copied, so that both policies meet the same chance.
+        rng: of the roll-outs.
 
     Returns:
         None where nothing can be judged, or is to be.
@@ -50,9 +49,7 @@ def refuses(
     if before is None or outlook.simulator is None or not count:
         return None
     process = replace(outlook.simulator, exploring_starts=0.0)
-    followed, followed_before = (
-        process.follow(policy, outlook.rewards_of, count, deepcopy(rng)) for policy in (new, before)
-    )
+    followed, followed_before = process.follow((new, before), outlook.rewards_of, count, rng)
     typical = max(float(np.median(followed_before.likeness)), np.finfo(np.float64).tiny)
 
     def earned(each: Followed) -> FloatArray:

@@ -48,7 +48,6 @@ from kreps.algorithms.reps import (
 )
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
-    REWARD_TOLERANCE,
     embedding_hyperparameters,
     feature_differences,
     restart_features,
@@ -206,7 +205,7 @@ def update(
         inputs = state_actions(sample, task)
         targets = (rewards[sampled] - rewards[sampled].mean())[:, None]
         reward_kernel, regulariser, reward_start = embedding_hyperparameters(
-            inputs, targets, cut_kernel, task, reward_start, rng, REWARD_TOLERANCE
+            inputs, targets, cut_kernel, task, reward_start, rng
         )
         embedded = choose_basis(reward_kernel, inputs, settings, settings.rank, rng)
         bases.append(embedded)

@@ -17,7 +17,6 @@ from kreps.algorithms.judgement import refuses
 from kreps.algorithms.optimism import optimism_of
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.transition_model import (
-    REWARD_TOLERANCE,
     feature_differences,
     fit_embedding,
     fit_regression,
@@ -197,7 +196,7 @@ def update(
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
         targets = (rewards - rewards.mean())[:, None]
         regression, reward_start = fit_regression(
-            data, targets, cut_kernel, task, reward_start, rng, REWARD_TOLERANCE
+            data, targets, cut_kernel, task, reward_start, rng
         )
         jitters.append(regression.factor.jitter)
         outlook = Outlook(

@@ -10,17 +10,12 @@ import numpy as np
 from kreps.arrays import FloatArray, IntArray
 from kreps.data import TaskSpec, Transitions
 from kreps.embedding import KernelEmbedding, PivotedEmbedding
-from kreps.hyperparameters import TOLERANCE, EmbeddingLoss, Prior, factor_distances, minimise
+from kreps.hyperparameters import EmbeddingLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel, SquaredExponential, cut_factors, median_lengthscales
 from kreps.settings import Settings
 
-FIT_SAMPLE = 300
+FIT_SAMPLE = 200
 """Samples on which hyper-parameters are fitted: the cost is cubic, the estimate no better."""
-
-REWARD_TOLERANCE = 1e-5
-"""Of the reward's fit.  Where a goal is seldom reached it is a small part of the error, and a fit
-that ends early has not found it yet."""
-
 
 CUT_LENGTHSCALE = np.pi
 """Of the numbers of angles in V's kernel, rad: a turn apart, states are ``exp(-2)`` alike, so that
@@ -35,6 +30,59 @@ def random_rows(n: int, rng: np.random.Generator) -> IntArray:
     if n <= FIT_SAMPLE:
         return np.arange(n)
     return np.sort(rng.choice(n, FIT_SAMPLE, replace=False))
+
+
+def telling_rows(squares: FloatArray, rng: np.random.Generator) -> tuple[IntArray, FloatArray]:
+    """At most `FIT_SAMPLE` row numbers, in order, and how many of all rows each stands for, (m,).
+
+    A goal that is seldom reached, or an end, is in a handful of many samples, and a fit that sees
+    none of them makes a model without it.  So half of the chance to be chosen is equal for all and
+    half goes by the square of what is to be predicted; each row then counts by the inverse of its
+    chance (importance sampling), so that the mean error is that of all rows, only less noisy.
+
+    Args:
+        squares: (n,) of what is to be predicted.
+        rng: of the choice.
+    """
+    n = len(squares)
+    if n <= FIT_SAMPLE:
+        return np.arange(n), np.ones(n)
+    equal = np.full(n, 1.0 / n)
+    total = float(squares.sum())
+    share = 0.5 * equal + 0.5 * (squares / total if total > 0.0 else equal)
+    chance = inclusion(share, FIT_SAMPLE)
+    # systematic: one in each unit of the summed chances, none of which is above one
+    marks = rng.uniform() + np.arange(FIT_SAMPLE)
+    rows = np.unique(np.minimum(np.searchsorted(np.cumsum(chance), marks), n - 1))
+    return rows, 1.0 / chance[rows]
+
+
+def evidence(squares: FloatArray, weights: FloatArray) -> float:
+    """How many errors of equal size those of all rows are worth: an effective sample size.
+
+    Errors are taken to be as large as what is to be predicted.  If that is one goal among rows of
+    nothing, most hyper-parameters are as good as others, and a prior has to choose.
+
+    Args:
+        squares: (m,) of what is to be predicted.
+        weights: (m,) how many rows each stands for.
+    """
+    most = float(squares.max(initial=0.0))
+    if most == 0.0:
+        return float(weights.sum())
+    mass = weights * (squares / most)
+    return float(mass.sum()) ** 2 / float(mass @ (squares / most))
+
+
+def inclusion(share: FloatArray, count: int) -> FloatArray:
+    """Chances (n,) that add up to ``count`` < n: ``share`` times a number, but none above one."""
+    chance = count * share
+    certain = np.zeros(len(share), dtype=bool)
+    while (chance > 1.0).any():
+        certain |= chance > 1.0
+        left = count - np.count_nonzero(certain)
+        chance = np.where(certain, 1.0, left * share / share[~certain].sum())
+    return chance
 
 
 def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) -> Kernel:
@@ -121,7 +169,6 @@ def embedding_hyperparameters(
     task: TaskSpec,
     start: FloatArray | None,
     rng: np.random.Generator,
-    tolerance: float = TOLERANCE,
 ) -> tuple[Kernel, float, FloatArray]:
     """Kernel and regulariser of the embedding by leave-one-out error (Eq. 4), and their logs.
 
@@ -130,28 +177,34 @@ def embedding_hyperparameters(
     Args:
         inputs: (n, ds + da) states and applied actions.
         targets: (n, r) what is to be predicted, such as features of the observed successors.
-        state_kernel: its factors are those of the embedding's kernel, with other lengthscales.
+        state_kernel: its factors are those of the embedding's kernel, with other lengthscales, of
+            which these are the typical ones.
         task: number of action coordinates.
         start: log hyper-parameters (g + da + 1,) to start the fit from; None for the median.
         rng: chooses the samples of the fit.
-        tolerance: gain of an iteration that ends the fit, as in `minimise`.
     """
     action_factors = tuple(
         SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
     )
     factors = (*state_kernel.factors, *action_factors)
-    sample = random_rows(len(inputs), rng)
-    median = np.log(median_lengthscales(factors, inputs, rng))
+    squares = np.sum((targets - targets.mean(axis=0)) ** 2, axis=1)
+    sample, weights = telling_rows(squares, rng)
+    of_actions = median_lengthscales(action_factors, inputs, rng)
+    median = np.log(np.append(state_kernel.lengthscales, of_actions))
     prior = Prior(
-        centre=np.append(median, 0.0),
-        spread=np.ones(len(factors) + 1),
+        centre=np.append(median, np.log(1e-3)),
+        spread=np.append(np.ones(len(factors)), 3.0),
         low=np.append(median - 3.0, np.log(1e-6)),
         high=np.append(median + 3.0, 0.0),
-        strength=0.0,
+        # the loss is twice minus the log density of one Gaussian error whose variance is fitted
+        strength=2.0 / evidence(squares[sample], weights),
     )
-    loss = EmbeddingLoss(factor_distances(factors, inputs[sample]), targets[sample])
-    start = np.append(median, np.log(1e-3)) if start is None else start
-    x = minimise(loss, prior, start, tolerance=tolerance)
+    loss = EmbeddingLoss(
+        factor_distances(factors, inputs[sample]), targets[sample], weights / weights.mean()
+    )
+    noisy = np.append(median, np.log(0.1))
+    starts = (prior.centre, noisy) if start is None else (start, prior.centre, noisy)
+    x = minimise(loss, prior, *starts)
     return Kernel(factors, np.exp(x[:-1])), float(np.exp(x[-1])), x
 
 
@@ -182,12 +235,11 @@ def fit_regression(
     task: TaskSpec,
     start: FloatArray | None,
     rng: np.random.Generator,
-    tolerance: float = TOLERANCE,
 ) -> tuple[KernelEmbedding | PivotedEmbedding, FloatArray]:
     """The same where only predictions are asked for: in few features, where these are enough."""
     inputs = state_actions(data, task)
     kernel, regulariser, x = embedding_hyperparameters(
-        inputs, targets, state_kernel, task, start, rng, tolerance
+        inputs, targets, state_kernel, task, start, rng
     )
     few = PivotedEmbedding.fit(kernel, inputs, regulariser)
     return few or KernelEmbedding.fit(kernel, inputs, regulariser), x
