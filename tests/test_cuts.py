@@ -126,5 +126,5 @@ def test_the_value_function_jumps_with_the_reward_and_survives_a_checkpoint(
         again = kreps.KREPS.resume(tmp_path / angles, env)
         np.testing.assert_array_equal(again.value_function(sides), [low, high])
         assert again.learn(1, progress=False).state.iteration == 3
-    # the reward does by 10 ((3 pi / 2)^2 - (pi / 2)^2), 197
-    assert jumps["cut"] > 100.0 > 10.0 * abs(jumps["round"])
+    # the reward does by 10 ((3 pi / 2)^2 - (pi / 2)^2), 197, and V has some of it after two updates
+    assert jumps["cut"] > 40.0 > 5.0 * abs(jumps["round"])

@@ -215,6 +215,18 @@ def test_the_search_recovers_the_lengthscale_of_smooth_data() -> None:
     assert found[2] > start[2] + 1.0
 
 
+def test_the_search_begins_at_the_best_of_its_starts() -> None:
+    loss, _, parameters = embedding_case(60, 15)
+    lost = np.append(np.full(3, -7.0), parameters[-1])  # no two samples alike: nothing is predicted
+    prior = box(parameters, 12.0)
+    np.testing.assert_allclose(loss(lost)[1], 0.0, atol=1e-12)
+    np.testing.assert_array_equal(minimise(loss, prior, lost), lost)
+    wanted = minimise(loss, prior, parameters)
+    for starts in ((lost, parameters), (parameters, lost)):
+        np.testing.assert_array_equal(minimise(loss, prior, *starts), wanted)
+    assert loss(wanted)[0] < loss(lost)[0]
+
+
 @pytest.mark.parametrize("half_width", [0.01, 0.3])
 def test_the_search_stays_in_its_box(half_width: float) -> None:
     loss, _, parameters = embedding_case(30, 8)

@@ -85,8 +85,9 @@ def test_cholesky_solves_linear_systems(columns: int | None) -> None:
     np.testing.assert_allclose(x, np.linalg.solve(a, b), rtol=1e-8, atol=1e-8)
 
 
-def test_inverse_is_the_inverse_and_exactly_symmetric() -> None:
-    a = positive_definite(25, seed=4)
+@pytest.mark.parametrize("n", [1, 25, 64, 65, 200])
+def test_inverse_is_the_inverse_and_exactly_symmetric(n: int) -> None:
+    a = positive_definite(n, seed=4)
     inverse = cholesky(a).inverse()
     np.testing.assert_allclose(inverse, np.linalg.inv(a), rtol=1e-8, atol=1e-8)
     np.testing.assert_array_equal(inverse, inverse.T)

@@ -226,9 +226,9 @@ def test_the_policy_is_the_weighted_process_of_the_commanded_actions() -> None:
 def test_fits_start_where_those_of_the_last_update_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     starts: list[FloatArray] = []
 
-    def spy(loss: Any, prior: Prior, start: FloatArray, **others: Any) -> FloatArray:
-        starts.append(start)
-        return minimise(loss, prior, start, **others)
+    def spy(loss: Any, prior: Prior, *given: FloatArray) -> FloatArray:
+        starts.append(given[0])
+        return minimise(loss, prior, *given)
 
     for module in (reps, transition_model):
         monkeypatch.setattr(module, "minimise", spy)

@@ -1,0 +1,97 @@
+"""What the hyper-parameters of a regression are fitted to: rows that tell, and what they weigh."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kreps.algorithms.transition_model import (
+    FIT_SAMPLE,
+    evidence,
+    fit_regression,
+    inclusion,
+    state_kernel,
+    telling_rows,
+)
+from kreps.arrays import FloatArray
+from kreps.data import Rollout, TaskSpec, Transitions
+
+TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
+
+
+def heavy_tailed(n: int = 1500) -> FloatArray:
+    return np.random.default_rng(0).standard_normal(n) ** 6
+
+
+def test_few_rows_are_all_taken() -> None:
+    rows, weights = telling_rows(heavy_tailed(FIT_SAMPLE), np.random.default_rng(0))
+    np.testing.assert_array_equal(rows, np.arange(FIT_SAMPLE))
+    np.testing.assert_array_equal(weights, 1.0)
+
+
+@pytest.mark.parametrize("squares", [heavy_tailed(), np.ones(777), np.zeros(777)])
+def test_sums_over_the_rows_are_those_of_all_on_average(squares: FloatArray) -> None:
+    summed = np.cos(np.arange(len(squares))) ** 2 + squares
+    found = []
+    for seed in range(400):
+        rows, weights = telling_rows(squares, np.random.default_rng(seed))
+        assert len(np.unique(rows)) == len(rows) and abs(len(rows) - FIT_SAMPLE) <= 1
+        found.append(weights @ summed[rows])
+    error = np.std(found) / np.sqrt(len(found))
+    assert np.mean(found) == pytest.approx(summed.sum(), abs=4.0 * error + 1e-9)
+
+
+def test_rare_rows_are_never_missed() -> None:
+    squares = np.full(1500, 1e-4)
+    rare = np.array([3, 700, 1499])
+    squares[rare] = 100.0
+    for seed in range(20):
+        rows, weights = telling_rows(squares, np.random.default_rng(seed))
+        assert np.isin(rare, rows).all()
+        np.testing.assert_array_equal(weights[np.isin(rows, rare)], 1.0)
+
+
+@pytest.mark.parametrize("count", [1, 10, 99])
+def test_no_chance_is_above_one_and_the_others_keep_their_proportion(count: int) -> None:
+    share = np.random.default_rng(1).exponential(size=100) ** 3
+    share /= share.sum()
+    chance = inclusion(share, count)
+    assert chance.sum() == pytest.approx(count)
+    assert chance.max() <= 1.0
+    free = chance < 1.0
+    np.testing.assert_allclose(chance[free] / share[free], (chance[free] / share[free])[0])
+    assert not free.all() or count < 1.0 / share.max()
+
+
+def test_the_evidence_is_the_number_of_rows_that_have_something_to_tell() -> None:
+    squares = np.array([4.0, 4.0, 4.0, 0.0, 0.0])
+    assert evidence(squares, np.ones(5)) == pytest.approx(3.0)
+    assert evidence(squares, np.array([2.0, 2.0, 2.0, 1.0, 9.0])) == pytest.approx(6.0)
+    assert evidence(1e-200 * squares, np.ones(5)) == pytest.approx(3.0)
+    assert evidence(np.zeros(5), np.full(5, 2.0)) == pytest.approx(10.0)
+
+
+def test_a_goal_in_eight_of_many_samples_is_learnt() -> None:
+    """Whichever rows are drawn: of 200 by chance alone one would be at the goal, if any."""
+    rng = np.random.default_rng(2)
+    states = rng.uniform(-1.0, 1.0, size=(1501, 2))
+    at_goal = np.linspace(0.86, 1.0, 8)
+    states[states[:, 0] > 0.85, 0] -= 0.3
+    goals = np.arange(100, 1500, 180)
+    states[goals, 0] = at_goal
+    actions = rng.uniform(-1.0, 1.0, size=(1500, 1))
+    rewards = -0.1 * actions[:, 0] ** 2
+    rewards[goals] += 100.0
+    data = Transitions.of([Rollout(states, actions, rewards)])
+    kernel = state_kernel(data, TASK, rng)
+    targets = (rewards - rewards.mean())[:, None] / rewards.std()
+    asked = np.column_stack([rng.uniform(0.88, 0.98, 60), rng.uniform(-0.9, 0.9, (60, 2))])
+    away = asked * np.array([0.6, 1.0, 1.0])
+    for seed in range(6):
+        model, _ = fit_regression(data, targets, kernel, TASK, None, np.random.default_rng(seed))
+        earned, elsewhere = (
+            rewards.mean() + rewards.std() * model.predictor(targets)(inputs)[:, 0]
+            for inputs in (asked, away)
+        )
+        assert np.mean(earned) > 30.0
+        assert np.abs(np.mean(elsewhere)) < 5.0
