@@ -529,7 +529,7 @@ def test_after_a_real_end_the_process_begins_again() -> None:
 
 
 def test_policies_side_by_side_meet_the_same_chance() -> None:
-    """Each is followed as it would be alone, from a generator of the same seed."""
+    """Where ends do not depend on the policy each is followed as it would be alone."""
     made = simulator(missed=1e-2, end=0.3, exploring_starts=0.5)
     forces = (-1.0, 0.0, 1.0)
     together = made.follow([*map(Push, forces)], angle, 20, np.random.default_rng(0))

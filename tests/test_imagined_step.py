@@ -549,9 +549,9 @@ def test_each_fit_of_the_policy_starts_from_the_one_before(
     starts: list[FloatArray] = []
     ends: list[FloatArray] = []
 
-    def spy(loss: Any, prior: Prior, start: FloatArray, **others: Any) -> FloatArray:
-        starts.append(start)
-        ends.append(minimise(loss, prior, start, **others))
+    def spy(loss: Any, prior: Prior, *given: FloatArray) -> FloatArray:
+        starts.append(given[0])
+        ends.append(minimise(loss, prior, *given))
         return ends[-1]
 
     for module in (reps, transition_model):

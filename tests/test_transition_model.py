@@ -5,16 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from kreps.algorithms import transition_model
 from kreps.algorithms.transition_model import (
     FIT_SAMPLE,
+    embedding_hyperparameters,
     evidence,
     fit_regression,
     inclusion,
+    state_actions,
     state_kernel,
     telling_rows,
 )
 from kreps.arrays import FloatArray
 from kreps.data import Rollout, TaskSpec, Transitions
+from kreps.hyperparameters import EmbeddingLoss, Prior
 
 TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
 
@@ -69,6 +73,40 @@ def test_the_evidence_is_the_number_of_rows_that_have_something_to_tell() -> Non
     assert evidence(squares, np.array([2.0, 2.0, 2.0, 1.0, 9.0])) == pytest.approx(6.0)
     assert evidence(1e-200 * squares, np.ones(5)) == pytest.approx(3.0)
     assert evidence(np.zeros(5), np.full(5, 2.0)) == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize("start", [None, np.array([0.3, -0.2, 0.1, -2.0])])
+def test_a_fit_has_weights_a_prior_and_more_than_one_start(
+    start: FloatArray | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[EmbeddingLoss, Prior, tuple[FloatArray, ...]]] = []
+
+    def spy(loss: EmbeddingLoss, prior: Prior, *starts: FloatArray) -> FloatArray:
+        asked.append((loss, prior, starts))
+        return prior.centre
+
+    monkeypatch.setattr(transition_model, "minimise", spy)
+    rng = np.random.default_rng(3)
+    rollout = Rollout(rng.normal(size=(901, 2)), rng.normal(size=(900, 1)), np.zeros(900))
+    data = Transitions.of([rollout])
+    kernel = state_kernel(data, TASK, rng)
+    targets = rng.normal(size=(900, 2)) ** 3
+    _, regulariser, _ = embedding_hyperparameters(
+        state_actions(data, TASK), targets, kernel, TASK, start, np.random.default_rng(4)
+    )
+    ((loss, prior, starts),) = asked
+    squares = np.sum((targets - targets.mean(axis=0)) ** 2, axis=1)
+    rows, weights = telling_rows(squares, np.random.default_rng(4))
+    np.testing.assert_array_equal(loss.features, targets[rows])
+    np.testing.assert_allclose(loss.weights, weights / weights.mean())
+    assert weights.max() > 2.0 * weights.min()
+    assert prior.strength == pytest.approx(2.0 / evidence(squares[rows], weights))
+    np.testing.assert_allclose(prior.centre[:2], np.log(kernel.lengthscales))
+    assert regulariser == pytest.approx(1e-3)
+    assert [float(np.exp(each[-1])) for each in starts[-2:]] == pytest.approx([1e-3, 0.1])
+    assert len(starts) == (2 if start is None else 3)
+    if start is not None:
+        np.testing.assert_array_equal(starts[0], start)
 
 
 def test_a_goal_in_eight_of_many_samples_is_learnt() -> None:

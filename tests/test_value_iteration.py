@@ -241,9 +241,9 @@ def test_expectations_that_are_none_do_not_blow_up() -> None:
 def test_a_fit_starts_where_that_of_the_last_update_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     starts: list[FloatArray] = []
 
-    def spy(loss: Any, prior: Prior, start: FloatArray, **others: Any) -> FloatArray:
-        starts.append(start)
-        return minimise(loss, prior, start, **others)
+    def spy(loss: Any, prior: Prior, *given: FloatArray) -> FloatArray:
+        starts.append(given[0])
+        return minimise(loss, prior, *given)
 
     monkeypatch.setattr(transition_model, "minimise", spy)
     state = LearnerState(Window(30))

@@ -1,7 +1,7 @@
 """Leave-one-out fits of lengthscales and regularisers, in closed form with analytic gradients.
 
 Both criteria depend on their parameters through one matrix ``C = K + noise`` and need only
-``C^-1``.  Each is minimised over log parameters, on a random sample of the data.
+``C^-1``.  Each is minimised over log parameters, on a sample of the data.
 """
 
 from __future__ import annotations

@@ -51,9 +51,11 @@ def telling_rows(squares: FloatArray, rng: np.random.Generator) -> tuple[IntArra
     total = float(squares.sum())
     share = 0.5 * equal + 0.5 * (squares / total if total > 0.0 else equal)
     chance = inclusion(share, FIT_SAMPLE)
-    # systematic: one in each unit of the summed chances, none of which is above one
+    # systematic, in random order: one in each unit of the summed chances, none of which exceeds one
+    order = rng.permutation(n)
     marks = rng.uniform() + np.arange(FIT_SAMPLE)
-    rows = np.unique(np.minimum(np.searchsorted(np.cumsum(chance), marks), n - 1))
+    places = np.unique(np.minimum(np.searchsorted(np.cumsum(chance[order]), marks), n - 1))
+    rows = np.sort(order[places])
     return rows, 1.0 / chance[rows]
 
 
@@ -61,7 +63,8 @@ def evidence(squares: FloatArray, weights: FloatArray) -> float:
     """How many errors of equal size those of all rows are worth: an effective sample size.
 
     Errors are taken to be as large as what is to be predicted.  If that is one goal among rows of
-    nothing, most hyper-parameters are as good as others, and a prior has to choose.
+    nothing, most hyper-parameters are as good as others, and a prior has to choose.  Rows that the
+    fit only has an estimate of count like those it sees: they would say the same.
 
     Args:
         squares: (m,) of what is to be predicted.
@@ -100,7 +103,7 @@ def with_cuts(kernel: Kernel, data: Transitions, task: TaskSpec, settings: Setti
     Args:
         kernel: over states, at V's lengthscales.
         data: tells where the cut is: within the gap that its angles leave of a turn.  An angle that
-            counts its turns has none, unless a fit of the lengthscales finds one of use.
+            counts its turns has none.
         task: which coordinates are angles.
         settings: ``angles``; nothing is changed where they are round.
     """
@@ -180,7 +183,7 @@ def embedding_hyperparameters(
         state_kernel: its factors are those of the embedding's kernel, with other lengthscales, of
             which these are the typical ones.
         task: number of action coordinates.
-        start: log hyper-parameters (g + da + 1,) to start the fit from; None for the median.
+        start: log hyper-parameters (g + da + 1,) where the last fit ended, if there was one.
         rng: chooses the samples of the fit.
     """
     action_factors = tuple(

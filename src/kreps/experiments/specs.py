@@ -165,7 +165,7 @@ BEYOND: dict[str, tuple[Curve, ...]] = {
     "ablation": tuple(("swing-up", m) for m in (DEFAULT, *ABLATIONS)),
 }
 """Experiments that are not among the paper's: run by name, not by ``all``."""
-FIRST_SEED = {"untuned": 1210, "ablation": 1210}
+FIRST_SEED = {"untuned": 1220, "ablation": 1220}
 """Of experiments that confirm what was found on others; 0 elsewhere."""
 PICTURES = ("figure-2a",)
 """Figures without an experiment: the features of the images."""
