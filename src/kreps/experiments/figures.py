@@ -172,8 +172,10 @@ def write_figure(
 
     write_results(folder, name, command, results)
     rows = named_rows(rows_of(results))
-    if name in STEP_BY_STEP:
-        write_atomically(folder / f"{name}-steps.md", (steps_table(rows) + "\n").encode())
+    if name in STEP_BY_STEP:  # of the numbers as the file has them, rounded: they can be read again
+        with open(folder / f"{name}.csv", newline="") as file:
+            table = steps_table(named_rows(list(csv.DictReader(file))))
+        write_atomically(folder / f"{name}-steps.md", (table + "\n").encode())
     references = {
         row["method"]: REFERENCE_REWARDS.get(TASKS[row["task"]].environment, {}) for row in rows
     }
