@@ -483,8 +483,8 @@ def test_evaluation_agrees_with_the_riccati_equation() -> None:
 def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem(
     recipe: str,
 ) -> None:
-    # Measured over seeds 0 to 7: with the recipe "observed" the cost is 1.02 to 1.11 of the optimum
-    # for seven, 1.32 for one.  With the default it is 1.02 to 1.19, after six updates 1.02 to 1.13.
+    # Measured over seeds 0 to 7: with the recipe "observed" the cost is 1.02 to 1.07 of the
+    # optimum.  With the default it is 1.01 to 1.05 for seven, 1.28 for one.
     # The first policy costs 54 times the optimum, doing nothing 4.6.
     _, best = optimum()
     shares = []

@@ -85,7 +85,7 @@ def test_cholesky_solves_linear_systems(columns: int | None) -> None:
     np.testing.assert_allclose(x, np.linalg.solve(a, b), rtol=1e-8, atol=1e-8)
 
 
-@pytest.mark.parametrize("n", [1, 25, 64, 65, 200])
+@pytest.mark.parametrize("n", [1, 25, 64, 65, 200, 513])
 def test_inverse_is_the_inverse_and_exactly_symmetric(n: int) -> None:
     a = positive_definite(n, seed=4)
     inverse = cholesky(a).inverse()

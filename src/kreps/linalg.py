@@ -41,7 +41,7 @@ class Cholesky:
 
     def inverse(self) -> FloatArray:
         """``A^-1``, (n, n) and symmetric."""
-        half, _ = lapack.dlauum(inverse_lower(self.lower), lower=1)  # above the diagonal: zero
+        half, _ = lapack.dlauum(inverse_lower(self.lower), lower=1, overwrite_c=1)  # zero above
         diagonal = np.diagonal(half).copy()
         whole = half + half.T
         np.fill_diagonal(whole, diagonal)

@@ -315,7 +315,7 @@ def expected_successors(
         own, observed: (m, r) features of the sample's states and successors.
         state_kernel: its factors are those of the model's kernel.
         task, settings, compute: of the update.
-        start: log hyper-parameters to start the fit from.
+        start: log hyper-parameters where the last fit ended, if there was one.
         rng: chooses the samples of the fit.
         clock: of the stages.
     """

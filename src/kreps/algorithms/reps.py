@@ -352,7 +352,7 @@ def expected_successors(
         basis, features: of V, and its features (m, r) of all points.
         state_kernel: its factors are those of the model's kernel.
         task, settings: limits of the actions, and which model.
-        start: log hyper-parameters to start the fit from.
+        start: log hyper-parameters where the last fit ended, if there was one.
         rng: chooses the samples of the fit.
         clock: of the stages.
     """

@@ -193,19 +193,19 @@ def embedding_hyperparameters(
     squares = np.sum((targets - targets.mean(axis=0)) ** 2, axis=1)
     sample, weights = telling_rows(squares, rng)
     of_actions = median_lengthscales(action_factors, inputs, rng)
-    median = np.log(np.append(state_kernel.lengthscales, of_actions))
+    typical = np.log(np.append(state_kernel.lengthscales, of_actions))
     prior = Prior(
-        centre=np.append(median, np.log(1e-3)),
+        centre=np.append(typical, np.log(1e-3)),
         spread=np.append(np.ones(len(factors)), 3.0),
-        low=np.append(median - 3.0, np.log(1e-6)),
-        high=np.append(median + 3.0, 0.0),
+        low=np.append(typical - 3.0, np.log(1e-6)),
+        high=np.append(typical + 3.0, 0.0),
         # the loss is twice minus the log density of one Gaussian error whose variance is fitted
         strength=2.0 / evidence(squares[sample], weights),
     )
     loss = EmbeddingLoss(
         factor_distances(factors, inputs[sample]), targets[sample], weights / weights.mean()
     )
-    noisy = np.append(median, np.log(0.1))
+    noisy = np.append(typical, np.log(0.1))
     starts = (prior.centre, noisy) if start is None else (start, prior.centre, noisy)
     x = minimise(loss, prior, *starts)
     return Kernel(factors, np.exp(x[:-1])), float(np.exp(x[-1])), x
