@@ -15,8 +15,9 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 import numpy as np
 
 from kreps import storage
-from kreps.algorithms import low_rank_reps, npalp, reps, value_iteration
+from kreps.algorithms import npalp, value_iteration
 from kreps.algorithms.state import LearnerState, UpdateReport
+from kreps.algorithms.update import update as reps_update
 from kreps.arrays import FloatArray
 from kreps.compute import Compute
 from kreps.controller import Policy
@@ -369,7 +370,6 @@ class KREPS(OnPolicyLearner[Settings]):
 
     method = "reps"
     settings_type = Settings
-    algorithm = staticmethod(reps.update)
 
     def __init__(
         self,
@@ -414,20 +414,13 @@ class KREPS(OnPolicyLearner[Settings]):
             )
         rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
         with blas_threads(self.threads):
-            self.state, info = low_rank_reps.update(
-                self.state, rollouts, self.task, self.settings, rng, self.compute
-            )
+            self.state, info = self._updated(rollouts, rng)
         return info
 
     def _updated(
         self, rollouts: list[Rollout], rng: np.random.Generator
     ) -> tuple[LearnerState, UpdateReport]:
-        samples = sum(map(len, self.state.extended_window(rollouts, self.task).rollouts))
-        if not low_rank_reps.applies(self.settings, samples):
-            return super()._updated(rollouts, rng)
-        return low_rank_reps.update(
-            self.state, rollouts, self.task, self.settings, rng, self.compute
-        )
+        return reps_update(self.state, rollouts, self.task, self.settings, rng, self.compute)
 
     @property
     def value_function(self) -> LinearFunction:

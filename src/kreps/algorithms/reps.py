@@ -1,48 +1,27 @@
-"""Algorithm 1 of the paper: REPS with RKHS embeddings, one update on one screen."""
+"""Algorithm 1 of the paper: REPS with RKHS embeddings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from math import inf
+from typing import Protocol
 
 import numpy as np
 
-from kreps.algorithms.boldness import is_judged, least_temperature, widening
-from kreps.algorithms.dynamics import Dynamics, fit_dynamics, observed_expectation
-from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
-from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine, places
-from kreps.algorithms.judgement import refuses
-from kreps.algorithms.optimism import optimism_of
+from kreps.algorithms.dynamics import Dynamics
+from kreps.algorithms.imagined_step import ImaginedSamples
 from kreps.algorithms.state import LearnerState, Stopwatch
-from kreps.algorithms.transition_model import (
-    feature_differences,
-    fit_embedding,
-    fit_regression,
-    random_rows,
-    restart_features,
-    state_kernel,
-    successor_features,
-    with_cuts,
-)
+from kreps.algorithms.transition_model import random_rows, state_kernel
 from kreps.arrays import FloatArray, IntArray
-from kreps.data import Rollout, TaskSpec, Transitions, Window
-from kreps.dual import (
-    DualProblem,
-    DualSolution,
-    Outcome,
-    effective_sample_size,
-    solve_dual,
-    standardise,
-)
-from kreps.embedding import KernelEmbedding, LeaveOneOut, SampleModel, TransitionModel
-from kreps.exploration import each_tells, tells_of_states
+from kreps.data import TaskSpec, Transitions, Window
+from kreps.dual import DualSolution, Problem, effective_sample_size
+from kreps.embedding import LeaveOneOut
 from kreps.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
 from kreps.kernels import Kernel
-from kreps.policies import MAX_SUPPORT, CostSensitiveGP
+from kreps.policies import LearntPolicy
 from kreps.settings import Settings
-from kreps.value import Basis, RBFGrid, RKHSBasis
+from kreps.value import Basis
 
 DROPPED_WEIGHT = 0.05
 """Samples with ``n p_i`` below this do not enter the policy: they say next to nothing."""
@@ -54,245 +33,109 @@ RIDGE_LEAST = 1e-3
 """Least ridge where the model asks for less: with a model without error V would follow the chance
 of a finite sample, and V must stay finite in directions that no state has."""
 
-_NOTES = {
-    Outcome.AT_FLOOR: "eta at its floor",
-    Outcome.FALLBACK: "by bisection",
-    Outcome.NOT_CONVERGED: "NOT CONVERGED",
-}
+
+def reps_step(
+    batch: Batch, state: LearnerState, eta_floor: float, rng: np.random.Generator
+) -> Step:
+    """One iteration of Algorithm 1 (van Hoof et al. 2015): from samples to a stochastic policy."""
+    kernel = state_kernel(batch.data, batch.task, rng)
+    features = batch.value_features(kernel, rng)  # Eq. 3
+    model = batch.transition_model(features, kernel, state.embedding_start, rng)  # Eq. 4
+    problem, dual = batch.solve_dual(features, model, eta_floor)  # Eqs. 2 and 5
+    policy = batch.fit_policy_to_data(dual.weights, kernel, state.policy_start, rng)  # Sec. 2
+    return Step(kernel, features, model, problem, dual, policy)
+
+
+class Batch(Protocol):
+    """The samples of one update, and how each line of Algorithm 1 is computed on them."""
+
+    task: TaskSpec
+    settings: Settings
+    window: Window
+    data: Transitions
+    rewards: FloatArray
+    reward_unit: float
+    size: int
+    seen: tuple[int, int] | None
+    actions: FloatArray
+    from_dataset: bool
+    jitters: list[float]
+    clock: Stopwatch
+
+    def of_data(self, p: FloatArray) -> FloatArray: ...
+
+    def value_features(self, kernel: Kernel, rng: np.random.Generator) -> ValueFeatures: ...
+
+    def transition_model(
+        self,
+        features: ValueFeatures,
+        kernel: Kernel,
+        start: FloatArray | None,
+        rng: np.random.Generator,
+    ) -> Expectation: ...
+
+    def solve_dual(
+        self, features: ValueFeatures, model: Expectation, eta_floor: float
+    ) -> tuple[Problem, DualSolution]: ...
+
+    def fit_policy_to_data(
+        self, p: FloatArray, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
+    ) -> PolicyFit: ...
+
+    def fit_policy(
+        self,
+        samples: PolicySamples,
+        kernel: Kernel,
+        start: FloatArray,
+        rng: np.random.Generator,
+        narrower: float = 1.0,
+    ) -> PolicyFit: ...
+
+    def fit_reward(
+        self, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
+    ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]: ...
 
 
 @dataclass(frozen=True)
-class UpdateInfo:
-    """What is only reported of an update.
+class ValueFeatures:
+    """Features of V in the samples in memory: own states, successors, mean of the start states."""
 
-    Attributes:
-        samples: n.
-        kl_bound: epsilon.
-        eta_floor: least temperature as taken, in standard deviations of the reward.
-        ridge: rho times the number of samples.
-        model_error: of the transition model by leave-one-out, relative (`LeaveOneOut.relative`);
-            nan without a model.
-        clipped: share of the commanded actions that lie beyond the limits: those of the new
-            roll-outs, of all kept ones if there are none, or of a data set's sample.
-        rank: features of V; ``rank_residual`` is the largest squared residual they leave.
-        dual: the last step's solution with its certificate.
-        effective_samples: effective sample size of the weights.
-        support: support points of the policy.
-        state_lengthscales: of V's kernel, but for cuts of angles.
-        embedding_parameters, policy_parameters: fitted values (not logs): lengthscales, then
-            lambda, or sf2 and l.  The former are those of the transition model, whichever it is.
-            After widened imagined steps the policy has its sf2 and noise divided.
-        noise: variance that actions are drawn with, in units of the action scale squared, by the
-            fitted policy.
-        refused: whether the model found the fitted policy worse than the one before, which then
-            acts on; None where nothing was judged.
-        jitter: largest jitter that a factorisation of this update needed; trial points of the
-            hyper-parameter searches do not count.
-        seconds: CPU seconds of this process by stage.
-    """
+    basis: Basis
+    own: FloatArray
+    observed: FloatArray
+    start: FloatArray
 
-    samples: int
-    kl_bound: float
-    eta_floor: float
-    ridge: float
-    model_error: float
-    clipped: float
-    rank: int
-    rank_residual: float
-    dual: DualSolution
-    effective_samples: float
+
+@dataclass(frozen=True)
+class PolicyFit:
+    """A fitted policy, its log hyper-parameters and how many support points it has."""
+
+    policy: LearntPolicy
+    x: FloatArray
     support: int
-    state_lengthscales: FloatArray
-    embedding_parameters: FloatArray | None
-    policy_parameters: FloatArray
-    noise: float
-    refused: bool | None
-    jitter: float
-    seconds: dict[str, float]
-
-    def numbers(self) -> dict[str, float]:
-        """The diagnostics of the method, by name."""
-        return {
-            "kl": self.dual.kl,
-            "eta": self.dual.eta,
-            "gap": self.dual.gap,
-            "effective_samples": self.effective_samples,
-        }
-
-    def shown(self) -> dict[str, str]:
-        """What a progress display shows, by column."""
-        return {
-            "KL / bound": f"{self.dual.kl:.3f} / {self.kl_bound:g}",
-            "eta": f"{self.dual.eta:.3g}",
-            "ESS": f"{self.effective_samples:.0f}",
-            "gap": f"{self.dual.gap:.0e}",
-            "note": f"{_NOTES.get(self.dual.outcome, '')}"
-            + ("  refused: the policy before acts" if self.refused else "")
-            + (f"  jitter {self.jitter:.0e}" if self.jitter else ""),
-        }
 
 
-def update(
-    state: LearnerState,
-    rollouts: Sequence[Rollout],
-    task: TaskSpec,
-    settings: Settings,
-    rng: np.random.Generator,
-) -> tuple[LearnerState, UpdateInfo]:
-    """One iteration of Algorithm 1, from new roll-outs to a new policy; nothing is modified.
+@dataclass(frozen=True)
+class Step:
+    """What one bounded step found, line by line."""
 
-    Raises:
-        DataError: no roll-outs at all, or some of another width than the task's.
-    """
-    window, data = state.extended(rollouts, task)
-    clock = Stopwatch()
-
-    # Eq. 3: a basis of V, chosen among the sampled states
-    kernel = state_kernel(data, task, rng)
-    cut_kernel = with_cuts(kernel, data, task, settings)
-    basis, features = value_basis(data, cut_kernel, settings)
-    clock.lap("basis")
-
-    # Eq. 4: expected features of each successor
-    expectation = expected_successors(
-        data, basis, features, kernel, task, settings, state.embedding_start, rng, clock
-    )
-    errors = expectation.errors
-    rewards, reward_unit = standardise(data.rewards)
-    jitters = [expectation.jitter]
-    imagining = imagines(settings, window, task)
-    simulator = (
-        simulator_of(expectation, data, kernel, task, settings, window) if imagining else None
-    )
-    judged = is_judged(simulator, settings)
-    clock.lap("embedding")
-
-    # Eqs. 2 and 5: minimise the dual
-    own = features[data.state]
-    restart = restart_features(features[data.start].mean(axis=0), own.mean(axis=0), settings)
-    ridge = stationarity_ridge(settings, errors)
-    problem = DualProblem(
-        rewards=rewards,
-        differences=feature_differences(
-            own, expectation.expected, restart, settings.restart_probability
-        ),
-        kl_bound=settings.kl_bound,
-        ridge=ridge / len(data),
-        eta_floor=least_temperature(judged, settings),
-    )
-    dual = solve_dual(problem)
-    clock.lap("dual")
-
-    # Sec. 2: generalise the weighted samples to a stochastic policy
-    support = PolicySamples.of(data, dual.weights, task)
-    policy_x = policy_hyperparameters(support, kernel, settings, state.policy_start, rng)
-    clock.lap("policy fit")
-    policy = fit_policy(support, kernel, task, policy_x)
-    clock.lap("policy")
-
-    # the same once more, for other actions in these states, and again in those they lead to
-    reward_start, refused = state.reward_start, None
-    if imagining and expectation.of_actions is not None:
-        # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
-        targets = (rewards - rewards.mean())[:, None]
-        regression, reward_start = fit_regression(
-            data, targets, cut_kernel, task, reward_start, rng
-        )
-        jitters.append(regression.factor.jitter)
-        outlook = Outlook(
-            states=data.states,
-            features=own,
-            features_at=basis.features,
-            restart=restart,
-            rewards=rewards,
-            expect=expectation.of_actions,
-            reward=regression.predictor(targets),
-            simulator=simulator,
-            optimism=optimism_of(simulator, rewards, dual.weights, state.iteration, settings),
-        )
-        first, earlier, steps = dual, None, places(outlook, settings)
-        # a goal that some roll-outs have not reached is known from few samples, and a policy that
-        # the model does not lead there would forget it
-        forgetful = not each_tells(window.rollouts, task)
-        for led in steps:
-            imagined = imagine(outlook, first.weights, policy, task, settings, ridge, rng, led)
-            # V is nearly known, the temperature is to be found anew: it may have to rise
-            dual = solve_dual(imagined.problem, start=(1.0, dual.theta))
-            found = PolicySamples.imagined(imagined, dual.weights, task)
-            support = found.beside(earlier) if earlier is not None and forgetful else found
-            support = support.heaviest(MAX_SUPPORT)
-            policy_x = policy_hyperparameters(support, kernel, settings, policy_x, rng)
-            narrower = widening(judged, settings) if led == steps[-1] else 1.0
-            policy = fit_policy(support, kernel, task, policy_x, narrower)
-            earlier = found
-        clock.lap("imagined step")
-        refused = refuses(policy, state.policy, outlook, settings, rng)
-        clock.lap("judgement")
-
-    new_state = state.after(
-        rollouts,
-        window,
-        policy=state.policy if refused else policy,
-        value=basis.function(reward_unit * dual.theta),
-        embedding_start=expectation.parameters,
-        reward_start=reward_start,
-        policy_start=policy_x,
-    )
-    info = UpdateInfo(
-        samples=len(data),
-        kl_bound=settings.kl_bound,
-        eta_floor=problem.eta_floor,
-        ridge=ridge,
-        model_error=float("nan") if errors is None else errors.relative,
-        clipped=share_clipped(
-            np.concatenate([r.actions for r in rollouts or window.rollouts]), task
-        ),
-        rank=features.shape[1],
-        rank_residual=basis.residual,
-        dual=dual,
-        effective_samples=effective_sample_size(dual.weights),
-        support=len(support.weights),
-        state_lengthscales=kernel.lengthscales,
-        embedding_parameters=(
-            None if expectation.parameters is None else np.exp(expectation.parameters)
-        ),
-        policy_parameters=np.exp(policy_x),
-        noise=policy.noise,
-        refused=refused,
-        jitter=max(dual.jitter, policy.jitter, *jitters),
-        seconds=clock.seconds,
-    )
-    return new_state, info
-
-
-def imagines(settings: Settings, window: Window, task: TaskSpec) -> bool:
-    """Whether other actions are: where no reward tells of the states, they have nothing to gain.
-
-    The next roll-outs then explore, whatever is learnt (`OnPolicyLearner.exploring`).
-    """
-    return settings.imagined > 0 and tells_of_states(window.rollouts, task)
-
-
-def value_basis(data: Transitions, kernel: Kernel, settings: Settings) -> tuple[Basis, FloatArray]:
-    """The basis of V, and the features (m, r) of all points."""
-    if settings.features == "grid":
-        return RBFGrid.over(kernel.factors, data.points, settings.grid_size)
-    return RKHSBasis.fit(
-        kernel, data.points, tolerance=settings.basis_tolerance, max_rank=settings.max_rank
-    )
+    kernel: Kernel
+    features: ValueFeatures
+    model: Expectation
+    problem: Problem
+    dual: DualSolution
+    policy: PolicyFit
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """What a transition model says of V's features in the successors of n samples.
+    """What a transition model says of V's features in the successors of the samples in memory.
 
     Attributes:
         expected: (n, r) ``E[phi(s') | s_i, a_i]``.
         errors: of the model; None without one.
-        of_actions: the same (m, r) for sample numbers (m,) and other actions in their states, or
-            in states that they are nearest to, side by side (m, ds + da); None without a model.
+        of_actions: the same (m, r) for sample numbers (m,) and other actions; None without a model.
         parameters: log hyper-parameters that the model was fitted with.
-        jitter: of its factorisation.
         dynamics: if it is these that were fitted.
     """
 
@@ -300,113 +143,7 @@ class Expectation:
     errors: LeaveOneOut | None
     of_actions: Callable[[IntArray, FloatArray], FloatArray] | None
     parameters: FloatArray | None
-    jitter: float
     dynamics: Dynamics | None
-
-
-def simulator_of(
-    expectation: Expectation,
-    data: Transitions,
-    kernel: Kernel,
-    task: TaskSpec,
-    settings: Settings,
-    window: Window,
-) -> Simulator | None:
-    """What simulates the process for an imagined step, if there is one and the model can.
-
-    Args:
-        expectation: of the samples.
-        data: in memory, of the window.
-        kernel: over states.
-        task, settings, window: of the update.
-    """
-    dynamics = expectation.dynamics
-    if dynamics is None or not can_be_simulated(data, task):
-        return None
-    return Simulator(
-        dynamics=dynamics,
-        data=data,
-        kernel=kernel,
-        task=task,
-        restart_probability=settings.restart_probability,
-        exploring_starts=settings.exploring_starts,
-        longest=max(map(len, window.rollouts)),
-    )
-
-
-def expected_successors(
-    data: Transitions,
-    basis: Basis,
-    features: FloatArray,
-    state_kernel: Kernel,
-    task: TaskSpec,
-    settings: Settings,
-    start: FloatArray | None,
-    rng: np.random.Generator,
-    clock: Stopwatch,
-) -> Expectation:
-    """Fit the transition model that the settings ask for, and ask it about the samples.
-
-    Args:
-        data: n transitions.
-        basis, features: of V, and its features (m, r) of all points.
-        state_kernel: its factors are those of the model's kernel.
-        task, settings: limits of the actions, and which model.
-        start: log hyper-parameters where the last fit ended, if there was one.
-        rng: chooses the samples of the fit.
-        clock: of the stages.
-    """
-    if settings.model == "dynamics":
-        dynamics, x, jitter = fit_dynamics(data, state_kernel, task, start, rng)
-        clock.lap("embedding fit")
-        own, observed = features[data.state], features[data.successor]
-        after_end = features[data.start].mean(axis=0)
-        expected, errors = observed_expectation(
-            data, basis, own, observed, after_end, dynamics, task
-        )
-        of_actions = partial(dynamics.expected_features, basis, after_end)
-        return Expectation(expected, errors, of_actions, x, jitter, dynamics)
-    origin = embedding_origin(data, features, settings)
-    successors = successor_features(data, features) - origin
-    model, parameters = transition_model(data, successors, state_kernel, task, settings, start, rng)
-    clock.lap("embedding fit")
-    expected = origin + model.expected_features(successors)
-    if not isinstance(model, KernelEmbedding):
-        return Expectation(expected, None, None, parameters, 0.0, None)
-    predict = model.predictor(successors)
-    return Expectation(
-        expected,
-        model.leave_one_out(successors),
-        lambda rows, inputs: origin[rows] + predict(inputs),
-        parameters,
-        model.factor.jitter,
-        None,
-    )
-
-
-def embedding_origin(data: Transitions, features: FloatArray, settings: Settings) -> FloatArray:
-    """What embedded features are counted from, (n, r): those of the state itself, or zero.
-
-    An embedding fades to its origin far from the data.  That the state stays is a better guess
-    there than that its features vanish, and a better one to learn corrections of.
-    """
-    own = features[data.state]
-    return np.zeros_like(own) if settings.model == "embedding" else own
-
-
-def transition_model(
-    data: Transitions,
-    successors: FloatArray,
-    state_kernel: Kernel,
-    task: TaskSpec,
-    settings: Settings,
-    start: FloatArray | None,
-    rng: np.random.Generator,
-) -> tuple[TransitionModel, FloatArray | None]:
-    """The transition model, and the log hyper-parameters it was fitted with."""
-    if settings.model == "sample":
-        return SampleModel(), None
-    return fit_embedding(data, successors, state_kernel, task, start, rng)
 
 
 def stationarity_ridge(settings: Settings, errors: LeaveOneOut | None) -> float:
@@ -415,11 +152,6 @@ def stationarity_ridge(settings: Settings, errors: LeaveOneOut | None) -> float:
         return settings.ridge
     assert errors is not None  # settings without a model name a ridge
     return max(errors.mean_square, RIDGE_LEAST)
-
-
-def share_clipped(actions: FloatArray, task: TaskSpec) -> float:
-    """Share of commanded action coordinates (n, da) that lie beyond the limits."""
-    return float(np.mean((actions < task.action_low) | (actions > task.action_high)))
 
 
 @dataclass(frozen=True)
@@ -560,23 +292,3 @@ def drawn_noise(samples: PolicySamples, fitted: float) -> tuple[FloatArray, floa
     """
     drawn = min(fitted, max(samples.spread, LEAST_NOISE))
     return samples.weights * (drawn / fitted), drawn
-
-
-def fit_policy(
-    samples: PolicySamples,
-    state_kernel: Kernel,
-    task: TaskSpec,
-    x: FloatArray,
-    narrower: float = 1.0,
-) -> CostSensitiveGP:
-    """The policy at log hyper-parameters ``x`` (g + 2,), its deviation so many times smaller."""
-    weights, noise = drawn_noise(samples, float(np.exp(x[-1])))
-    return CostSensitiveGP(
-        task,
-        state_kernel.with_lengthscales(np.exp(x[:-2])),
-        samples.states,
-        samples.targets,
-        weights,
-        signal=float(np.exp(x[-2])) / narrower**2,  # of process and noise, so that the mean stays
-        noise=noise / narrower**2,
-    )
