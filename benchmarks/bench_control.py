@@ -11,10 +11,11 @@ from data import policy_with_support, swing_up
 from measuring import Measure
 from scipy.linalg import solve_triangular
 
-from kreps.arrays import FloatArray
-from kreps.controller import Policy
-from kreps.policies import CostSensitiveGP, StochasticPolicy
-from kreps.rollout import simulate
+from kreps.kernels.arrays import FloatArray
+from kreps.learning.collect import simulate
+from kreps.learning.policy import Policy
+from kreps.policies.base import StochasticPolicy
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 
 SUPPORT, ROLLOUTS, STEPS = 1500, 10, 50
 

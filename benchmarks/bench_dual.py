@@ -9,16 +9,13 @@ from criteria import Seconds, Share
 from data import swing_up
 from measuring import Measure
 
+from kreps.algorithms.dual import DualProblem, Moments, standardise
+from kreps.algorithms.newton import solve_dual
 from kreps.algorithms.reps import stationarity_ridge
-from kreps.algorithms.transition_model import (
-    feature_differences,
-    state_kernel,
-    successor_features,
-)
-from kreps.arrays import FloatArray
-from kreps.dual import DualProblem, Moments, solve_dual, standardise
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.basis import RKHSBasis
+from kreps.models.transition import feature_differences, state_kernel, successor_features
 from kreps.settings import RECIPES
-from kreps.value import RKHSBasis
 
 
 class Counting(DualProblem):

@@ -9,15 +9,11 @@ from data import swing_up
 from measuring import Measure
 
 from kreps.algorithms.reps import PolicySamples, policy_hyperparameters, value_basis
-from kreps.algorithms.transition_model import (
-    FIT_SAMPLE,
-    fit_embedding,
-    state_kernel,
-    successor_features,
-)
-from kreps.embedding import KernelEmbedding
-from kreps.hyperparameters import EmbeddingLoss, PolicyLoss, factor_distances
-from kreps.kernels import Kernel, SquaredExponential, median_lengthscales
+from kreps.kernels.hyperparameters import EmbeddingLoss, PolicyLoss, factor_distances
+from kreps.kernels.kernel import Kernel, SquaredExponential, median_lengthscales
+from kreps.kernels.regression import KernelEmbedding
+from kreps.kernels.sampling import FIT_SAMPLE
+from kreps.models.transition import fit_embedding, state_kernel, successor_features
 
 N = 1500
 RNG = np.random.default_rng

@@ -8,9 +8,9 @@ import pytest
 from criteria import Share, TimesAsLong, TimesFaster
 from measuring import Measure
 
-from kreps.arrays import FloatArray
 from kreps.envs.image_swing_up import image
-from kreps.kernels import Kernel, Periodic, SquaredExponential, factors_of
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import Kernel, Periodic, SquaredExponential, factors_of
 
 RNG = np.random.default_rng(0)
 

@@ -10,9 +10,10 @@ import pytest
 from criteria import Quality, Share, TimesFaster
 from measuring import Measure
 
-from kreps.arrays import FloatArray, IntArray
-from kreps.kernels import gaussian_gram
-from kreps.linalg import PivotedCholesky, cholesky, pivoted_cholesky
+from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.kernels.gram import gaussian_gram
+from kreps.kernels.linalg import cholesky
+from kreps.kernels.pivoted_cholesky import PivotedCholesky, pivoted_cholesky
 
 RNG = np.random.default_rng(0)
 ROWS, RANK = 100_000, 500

@@ -13,8 +13,8 @@ from criteria import Seconds, TimesAsLong
 from measuring import Measure
 
 from kreps import KREPS, Rollout
-from kreps.policies import BangBang
-from kreps.rollout import simulate
+from kreps.learning.collect import simulate
+from kreps.policies.exploration import BangBang
 
 STEPS = 50  # of a roll-out
 SEED = 100

@@ -11,10 +11,10 @@ import numpy as np
 
 from kreps import KREPS, Rollout
 from kreps.algorithms.state import LearnerState
-from kreps.data import Transitions
-from kreps.policies import CostSensitiveGP
-from kreps.rollout import collect
-from kreps.threads import blas_threads
+from kreps.data.rollout import Transitions
+from kreps.kernels.threads import blas_threads
+from kreps.learning.collect import collect
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 
 SEED = 100
 

@@ -27,17 +27,18 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import kreps
-from kreps.data import TaskSpec
-from kreps.dataset import CHUNK
+from kreps.app.plots import BLUE, GREY, ORANGE, STYLE
+from kreps.data.dataset import CHUNK
+from kreps.data.task import TaskSpec
 from kreps.experiments.runner import commit
 from kreps.experiments.tables import markdown
-from kreps.kernels import Kernel, factors_of
-from kreps.plotting import BLUE, GREY, ORANGE, STYLE
-from kreps.policies import BangBang, CostSensitiveGP
-from kreps.rollout import simulate
-from kreps.sparse_gp import PolicySums, SparseGP
-from kreps.threads import blas_threads
-from kreps.value import FourierBasis, RKHSBasis
+from kreps.kernels.basis import FourierBasis, RKHSBasis
+from kreps.kernels.kernel import Kernel, factors_of
+from kreps.kernels.threads import blas_threads
+from kreps.learning.collect import simulate
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
+from kreps.policies.exploration import BangBang
+from kreps.policies.sparse_gp import PolicySums, SparseGP
 
 TASK = "kreps/SwingUp-v0"
 SEEDS = range(110, 115)  # not those of any reported result

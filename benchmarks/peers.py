@@ -56,18 +56,18 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from kreps.arrays import FloatArray
-from kreps.data import TaskSpec
+from kreps.app.run_folder import versions
+from kreps.data.task import TaskSpec
 from kreps.envs import RandomRestart
-from kreps.evaluation import EPISODES, STEPS, evaluate
 from kreps.experiments.executors import executor
 from kreps.experiments.runner import commit
 from kreps.experiments.specs import TASKS as OURS
-from kreps.rollout import Environment, task_of
-from kreps.runs import versions
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.threads import blas_threads
+from kreps.learning.environment import Environment, task_of
+from kreps.learning.evaluate import EPISODES, STEPS, evaluate
+from kreps.learning.storage import write_atomically
 from kreps.seeding import Purpose, integer_seed
-from kreps.storage import write_atomically
-from kreps.threads import blas_threads
 
 RESTART = 0.02
 MARKS = (3000, 5000, 8000)

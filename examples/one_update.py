@@ -23,15 +23,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from kreps.algorithms import reps
-from kreps.algorithms.state import LearnerState
-from kreps.algorithms.transition_model import (
-    feature_differences,
-    state_kernel,
-    successor_features,
-)
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Window
-from kreps.dual import (
+from kreps.algorithms.dual import (
     DualProblem,
     bellman_errors,
     dual_gradient,
@@ -39,15 +31,23 @@ from kreps.dual import (
     effective_sample_size,
     kl_from_uniform,
     sample_weights,
-    solve_dual,
     standardise,
 )
-from kreps.embedding import KernelEmbedding
+from kreps.algorithms.newton import solve_dual
+from kreps.algorithms.state import LearnerState
+from kreps.app.plots import BLUE, GREY, ORANGE, STYLE
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
+from kreps.data.window import Window
 from kreps.envs.restart import restart_length
-from kreps.plotting import BLUE, GREY, ORANGE, STYLE
-from kreps.policies import CostSensitiveGP, Gaussian, StochasticPolicy
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.basis import KernelExpansion, RKHSBasis
+from kreps.kernels.regression import KernelEmbedding
+from kreps.models.transition import feature_differences, state_kernel, successor_features
+from kreps.policies.base import StochasticPolicy
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
+from kreps.policies.exploration import Gaussian
 from kreps.settings import settings_of
-from kreps.value import KernelExpansion, RKHSBasis
 
 NOTEBOOK = "ipykernel" in sys.modules
 parser = argparse.ArgumentParser(

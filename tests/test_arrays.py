@@ -15,16 +15,27 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps import dataset as dataset_module
-from kreps.algorithms import low_rank_reps
+from kreps.algorithms import low_rank
+from kreps.algorithms.dual import Moments
 from kreps.algorithms.reps import UpdateInfo
-from kreps.arrays import Array, FloatArray, as_float, as_numpy, columns, like, namespace, rows
-from kreps.compute import Compute
-from kreps.data import Rollout, TaskSpec
-from kreps.dual import Moments
-from kreps.embedding import FeatureRegression, KernelEmbedding, RegressionSums, SampleModel
+from kreps.data import dataset as dataset_module
+from kreps.data.compute import Compute
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
 from kreps.errors import NumericalError
-from kreps.kernels import (
+from kreps.kernels.arrays import (
+    Array,
+    FloatArray,
+    as_float,
+    as_numpy,
+    columns,
+    like,
+    namespace,
+    rows,
+)
+from kreps.kernels.basis import Basis, FourierBasis, RBFGrid, RKHSBasis
+from kreps.kernels.gram import gaussian_gram
+from kreps.kernels.kernel import (
     CutAngle,
     Factor,
     Kernel,
@@ -32,14 +43,13 @@ from kreps.kernels import (
     SmoothedImage,
     SquaredExponential,
     factors_of,
-    gaussian_gram,
 )
-from kreps.linalg import cholesky, solve_lower, solve_lower_transposed, with_diagonal
-from kreps.policies import BangBang
-from kreps.rollout import collect
+from kreps.kernels.linalg import cholesky, solve_lower, solve_lower_transposed, with_diagonal
+from kreps.kernels.regression import FeatureRegression, KernelEmbedding, RegressionSums, SampleModel
+from kreps.learning.collect import collect
+from kreps.policies.exploration import BangBang
+from kreps.policies.sparse_gp import PolicySums
 from kreps.settings import settings_of
-from kreps.sparse_gp import PolicySums
-from kreps.value import Basis, FourierBasis, RBFGrid, RKHSBasis
 
 DEVICE = array_api_strict.Device("device1")
 TASK = TaskSpec(2, [-30.0], [30.0], (0,))  # type: ignore[arg-type]
@@ -282,7 +292,7 @@ def rollouts() -> list[Rollout]:
 def streamed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Samples so few and chunks so short that everything is summed over chunks, the dual too."""
     monkeypatch.setattr(dataset_module, "CHUNK", 100)
-    monkeypatch.setattr(low_rank_reps, "SAMPLE", 200)
+    monkeypatch.setattr(low_rank, "SAMPLE", 200)
 
 
 def updated(

@@ -6,15 +6,15 @@ from typing import cast
 
 import pytest
 
-from kreps.algorithms.boldness import (
+from kreps.algorithms.acceptance import (
     ETA_FLOOR_JUDGED,
     ETA_FLOOR_NOT_JUDGED,
     is_judged,
     least_temperature,
     widening,
 )
-from kreps.algorithms.imagined_rollouts import Simulator
-from kreps.dual import ETA_LEAST
+from kreps.algorithms.dual import ETA_LEAST
+from kreps.models.model_env import Simulator
 from kreps.settings import settings_of
 
 SIMULATOR = cast(Simulator, object())  # only whether there is one counts

@@ -19,8 +19,9 @@ import pytest
 from PIL import Image
 
 import kreps
-from kreps import cli, export
-from kreps.evaluation import Greedy, evaluate
+from kreps.app import cli
+from kreps.learning import onnx as export
+from kreps.learning.evaluate import Greedy, evaluate
 
 NAME = "kreps/SwingUp-v0"
 TINY = [

@@ -17,14 +17,15 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import kreps
-from kreps import dataset as dataset_module
-from kreps.algorithms import low_rank_reps
-from kreps.compute import AHEAD, Compute
-from kreps.data import Rollout, TaskSpec
-from kreps.dataset import Dataset
+from kreps.algorithms import low_rank
+from kreps.data import dataset as dataset_module
+from kreps.data.compute import AHEAD, Compute
+from kreps.data.dataset import Dataset
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
 from kreps.errors import DataError
-from kreps.policies import BangBang
-from kreps.rollout import collect
+from kreps.learning.collect import collect
+from kreps.policies.exploration import BangBang
 
 TASK = TaskSpec(2, [-30.0], [30.0], (0,))  # type: ignore[arg-type]
 
@@ -144,7 +145,7 @@ def folder(rollouts: list[Rollout], tmp_path: Path) -> Path:
 def streamed(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chunks so short, and samples so few, that every sum is taken over several chunks."""
     monkeypatch.setattr(dataset_module, "CHUNK", 100)
-    monkeypatch.setattr(low_rank_reps, "SAMPLE", 200)
+    monkeypatch.setattr(low_rank, "SAMPLE", 200)
 
 
 def allow_two_blas_threads() -> None:

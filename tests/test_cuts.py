@@ -10,16 +10,17 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.algorithms.transition_model import (
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import CutAngle, Kernel, Periodic
+from kreps.models.transition import (
     CUT_LENGTHSCALE,
     fit_regression,
     state_actions,
     state_kernel,
     with_cuts,
 )
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.kernels import CutAngle, Kernel, Periodic
 
 TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]), periodic=(0,))
 TURN = 2.0 * np.pi

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Transitions, Window
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.data.window import Window
 from kreps.errors import ConfigurationError, DataError
+from kreps.kernels.arrays import FloatArray
 
 
 def rollout(

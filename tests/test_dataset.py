@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps import dataset as dataset_module
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.dataset import CHUNK, Dataset
+from kreps.data import dataset as dataset_module
+from kreps.data.dataset import CHUNK, Dataset
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, DataError, StorageError
-from kreps.storage import save_policy
+from kreps.kernels.arrays import FloatArray
+from kreps.learning.storage import save_policy
 
 TASK = TaskSpec(3, np.array([-1.0, 0.0]), np.array([1.0, 6.0]))
 LENGTHS = [4, 1, 7, 2, 2, 9, 1, 5]

@@ -17,12 +17,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
-from kreps import cli, diagnosis, diagnosis_page, plotting, report
-from kreps.diagnosis import Finding, Trend, diagnose, trend
-from kreps.dual import Outcome
+from kreps.algorithms.dual import Outcome
+from kreps.app import cli, diagnosis, diagnosis_page, report
+from kreps.app import plots as plotting
+from kreps.app.diagnosis import Finding, Trend, diagnose, trend
+from kreps.app.run_folder import COLUMNS, NEWER, RunConfig, RunFolder, progress_row, rank_cap
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import StorageError
-from kreps.runs import COLUMNS, NEWER, RunConfig, RunFolder, progress_row, rank_cap
 from kreps.settings import Settings
 
 NAME = "kreps/SwingUp-v0"

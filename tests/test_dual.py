@@ -11,18 +11,12 @@ import pytest
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
-from kreps.arrays import FloatArray, IntArray
-from kreps.dual import (
-    CENTRED,
-    DECREMENT_TOLERANCE,
+from kreps.algorithms.dual import (
     ETA_LEAST,
-    GAP_TOLERANCE,
-    KL_TOLERANCE,
     DualProblem,
     DualSolution,
     Moments,
     Outcome,
-    _newton,
     bellman_errors,
     dual_gradient,
     dual_hessian,
@@ -31,12 +25,20 @@ from kreps.dual import (
     kl_from_uniform,
     primal_value,
     sample_weights,
-    solve_dual,
     standardise,
 )
-from kreps.embedding import SampleModel
-from kreps.kernels import Kernel, factors_of
-from kreps.value import RBFGrid
+from kreps.algorithms.newton import (
+    CENTRED,
+    DECREMENT_TOLERANCE,
+    GAP_TOLERANCE,
+    KL_TOLERANCE,
+    _newton,
+    solve_dual,
+)
+from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.kernels.basis import RBFGrid
+from kreps.kernels.kernel import Kernel, factors_of
+from kreps.kernels.regression import SampleModel
 
 TINY_FLOOR = 1e-6
 

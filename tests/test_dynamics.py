@@ -6,9 +6,15 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps import embedding
-from kreps.algorithms.chunk_sums import FeatureChanges, PredictedSuccessors
-from kreps.algorithms.dynamics import (
+from kreps.algorithms.streaming import FeatureChanges, PredictedSuccessors
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.kernels import regression as embedding
+from kreps.kernels.arrays import FloatArray, as_float
+from kreps.kernels.basis import RKHSBasis
+from kreps.kernels.kernel import Kernel, SquaredExponential
+from kreps.kernels.regression import ROWS, FeatureRegression, KernelEmbedding
+from kreps.models.dynamics import (
     Dynamics,
     Motion,
     fit_dynamics,
@@ -16,12 +22,7 @@ from kreps.algorithms.dynamics import (
     observed_expectation,
     state_changes,
 )
-from kreps.algorithms.transition_model import state_actions, state_kernel
-from kreps.arrays import FloatArray, as_float
-from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.embedding import ROWS, FeatureRegression, KernelEmbedding
-from kreps.kernels import Kernel, SquaredExponential
-from kreps.value import RKHSBasis
+from kreps.models.transition import state_actions, state_kernel
 
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
 

@@ -8,9 +8,11 @@ from operator import add
 import numpy as np
 import pytest
 
-from kreps import embedding
-from kreps.arrays import FloatArray
-from kreps.embedding import (
+from kreps.kernels import regression as embedding
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.basis import Basis, FourierBasis, RKHSBasis
+from kreps.kernels.kernel import Kernel, Periodic, SquaredExponential, factors_of
+from kreps.kernels.regression import (
     FeatureRegression,
     KernelEmbedding,
     LeaveOneOut,
@@ -18,8 +20,6 @@ from kreps.embedding import (
     RegressionSums,
     SampleModel,
 )
-from kreps.kernels import Kernel, Periodic, SquaredExponential, factors_of
-from kreps.value import Basis, FourierBasis, RKHSBasis
 
 
 def fitted(n: int, seed: int, regulariser: float) -> tuple[KernelEmbedding, FloatArray]:

@@ -13,16 +13,16 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import kreps
-from kreps.arrays import FloatArray
-from kreps.data import TaskSpec
+from kreps.data.task import TaskSpec
 from kreps.envs import swing_up
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.envs.restart import restart_length, stratified_lengths
 from kreps.envs.swing_up import SwingUp, SwingUpBatch
 from kreps.errors import ConfigurationError
-from kreps.evaluation import discounted_average, evaluation_rollouts
-from kreps.policies import StochasticPolicy
-from kreps.rollout import task_of
+from kreps.kernels.arrays import FloatArray
+from kreps.learning.environment import task_of
+from kreps.learning.evaluate import discounted_average, evaluation_rollouts
+from kreps.policies.base import StochasticPolicy
 
 NAME = "kreps/SwingUp-v0"
 HANGING = (np.array([np.pi]), np.array([0.0]))

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from kreps.dual import KL_TOLERANCE, kl_from_uniform
+from kreps.algorithms.dual import kl_from_uniform
+from kreps.algorithms.newton import KL_TOLERANCE
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPT = ROOT / "examples/one_update.py"

@@ -16,15 +16,6 @@ import pytest
 import kreps
 from kreps.errors import CellFailure, ConfigurationError, StorageError
 from kreps.experiments import claims, search
-from kreps.experiments.cells import (
-    Cell,
-    cell_of,
-    commits_of,
-    name_of,
-    read_cell,
-    run_cell,
-    write_cell,
-)
 from kreps.experiments.claims import CLAIMS, Claim, Kind, judge, verdict, write_claims
 from kreps.experiments.executors import executor
 from kreps.experiments.figures import (
@@ -38,7 +29,16 @@ from kreps.experiments.figures import (
 )
 from kreps.experiments.runner import figure_cells, run_cells
 from kreps.experiments.specs import FIGURES, METHODS, TASKS
-from kreps.learner import LEARNERS
+from kreps.experiments.trials import (
+    Cell,
+    cell_of,
+    commits_of,
+    name_of,
+    read_cell,
+    run_cell,
+    write_cell,
+)
+from kreps.learning.learner import LEARNERS
 
 TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 

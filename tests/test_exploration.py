@@ -10,18 +10,11 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.data import Rollout, TaskSpec, Window
-from kreps.exploration import (
-    PINK,
-    RED,
-    WHITE,
-    coloured_noise,
-    each_tells,
-    extended,
-    latest,
-    tells_alone,
-    tells_of_states,
-)
+from kreps.data.rewards import each_tells, tells_alone, tells_of_states
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
+from kreps.data.window import Window, extended, latest
+from kreps.policies.exploration import PINK, RED, WHITE, coloured_noise
 
 TASK = TaskSpec(2, np.array([-2.0, -1.0]), np.array([2.0, 1.0]))
 

@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps import export
-from kreps.arrays import FloatArray
-from kreps.data import TaskSpec
+from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, StorageError
-from kreps.kernels import Kernel
-from kreps.policies import CostSensitiveGP
-from kreps.sparse_gp import SparseGP
-from kreps.value_policies import LipschitzPolicy
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import Kernel
+from kreps.learning import onnx as export
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
+from kreps.policies.sparse_gp import SparseGP
+from kreps.policies.value_based import LipschitzPolicy
 
 onnx = pytest.importorskip("onnx")
 onnxruntime = pytest.importorskip("onnxruntime")

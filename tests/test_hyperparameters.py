@@ -7,12 +7,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from kreps.arrays import FloatArray
-from kreps.data import TaskSpec
+from kreps.data.task import TaskSpec
 from kreps.errors import NumericalError
-from kreps.hyperparameters import EmbeddingLoss, PolicyLoss, Prior, factor_distances, minimise
-from kreps.kernels import Kernel, Periodic, SquaredExponential
-from kreps.policies import CostSensitiveGP
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.hyperparameters import (
+    EmbeddingLoss,
+    PolicyLoss,
+    Prior,
+    factor_distances,
+    minimise,
+)
+from kreps.kernels.kernel import Kernel, Periodic, SquaredExponential
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 
 FACTORS = (Periodic((0,)), SquaredExponential((1,)), SquaredExponential((2,)))
 

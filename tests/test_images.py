@@ -13,13 +13,12 @@ from scipy.ndimage import gaussian_filter
 
 import kreps
 from kreps.algorithms import reps
-from kreps.algorithms.transition_model import state_kernel, successor_features
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.embedding import KernelEmbedding, SampleModel
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
 from kreps.envs.image_swing_up import PIXELS, image
 from kreps.errors import ConfigurationError, StorageError
-from kreps.kernels import (
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import (
     IMAGE_BLUR,
     Kernel,
     SmoothedImage,
@@ -28,6 +27,8 @@ from kreps.kernels import (
     median_lengthscales,
     squared_distances,
 )
+from kreps.kernels.regression import KernelEmbedding, SampleModel
+from kreps.models.transition import state_kernel, successor_features
 from kreps.settings import Settings, settings_of
 
 ALL = tuple(range(PIXELS**2))

@@ -14,25 +14,20 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps import policies
-from kreps.algorithms import low_rank_reps, reps
-from kreps.algorithms.boldness import ETA_FLOOR_JUDGED, ETA_FLOOR_NOT_JUDGED
-from kreps.algorithms.dynamics import TREND_SAMPLES, Dynamics, Motion, fit_dynamics
-from kreps.algorithms.imagined_rollouts import (
-    AVERAGED,
-    Followed,
-    Simulator,
-    average_reward,
-    can_be_simulated,
-)
-from kreps.algorithms.imagined_step import Outlook, imagine
-from kreps.algorithms.judgement import refuses
-from kreps.algorithms.optimism import Optimism
+from kreps.algorithms import low_rank, reps
+from kreps.algorithms.acceptance import ETA_FLOOR_JUDGED, ETA_FLOOR_NOT_JUDGED, refuses
+from kreps.algorithms.generated import imagine
 from kreps.algorithms.reps import UpdateInfo
-from kreps.algorithms.transition_model import feature_differences
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.kernels import Kernel
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import Kernel
+from kreps.models.dynamics import TREND_SAMPLES, Dynamics, Motion, fit_dynamics
+from kreps.models.model_env import AVERAGED, Followed, Simulator, average_reward, can_be_simulated
+from kreps.models.novelty import Optimism
+from kreps.models.transition import feature_differences
+from kreps.models.world_model import Outlook
+from kreps.policies import cost_sensitive_gp as policies
 from kreps.settings import settings_of
 
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]), periodic=(0,))
@@ -254,7 +249,7 @@ def test_the_policy_has_targets_where_no_roll_out_was(
 def test_a_share_of_the_actions_is_drawn_along_them(
     approximation: str, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module: Any = reps if approximation == "exact" else low_rank_reps
+    module: Any = reps if approximation == "exact" else low_rank
     outlooks: list[tuple[Outlook, Any]] = []
 
     def watch(outlook: Outlook, *others: Any) -> Any:
@@ -392,7 +387,7 @@ def one_silent() -> list[Rollout]:
 def test_sampled_states_stay_in_the_policy_where_not_each_roll_out_tells(
     approximation: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module: Any = reps if approximation == "exact" else low_rank_reps
+    module: Any = reps if approximation == "exact" else low_rank
     fitted: list[reps.PolicySamples] = []
     fit = module.policy_hyperparameters
 
@@ -643,7 +638,7 @@ def test_without_a_policy_before_or_a_simulator_nothing_is_judged() -> None:
 def test_a_policy_that_is_refused_does_not_act(
     approximation: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module: Any = reps if approximation == "exact" else low_rank_reps
+    module: Any = reps if approximation == "exact" else low_rank
     asked: list[tuple[Any, Any, int]] = []
     said = iter((None, True, False))
 

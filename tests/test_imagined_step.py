@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps import embedding, policies
-from kreps.algorithms import imagined_step, low_rank_reps, reps, transition_model
-from kreps.algorithms.dynamics import Motion
-from kreps.algorithms.imagined_step import ImaginedSamples, Outlook, imagine, resample
+from kreps.algorithms import generated as imagined_step
+from kreps.algorithms import low_rank, reps
+from kreps.algorithms.dual import ETA_LEAST, DualProblem, effective_sample_size, standardise
+from kreps.algorithms.generated import ImaginedSamples, imagine
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
     RIDGE_LEAST,
@@ -26,24 +26,30 @@ from kreps.algorithms.reps import (
     value_basis,
 )
 from kreps.algorithms.state import Stopwatch
-from kreps.algorithms.transition_model import (
+from kreps.data.dataset import Dataset
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.kernels import regression as embedding
+from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.kernels.basis import Basis, RKHSBasis
+from kreps.kernels.hyperparameters import Prior, minimise
+from kreps.kernels.kernel import Kernel, SquaredExponential
+from kreps.kernels.regression import FeatureRegression, KernelEmbedding, LeaveOneOut, RegressionSums
+from kreps.kernels.sampling import resample
+from kreps.models import transition as transition_model
+from kreps.models.dynamics import Motion
+from kreps.models.transition import (
     feature_differences,
     fit_embedding,
     restart_features,
     state_actions,
     state_kernel,
 )
-from kreps.arrays import FloatArray, IntArray
-from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.dataset import Dataset
-from kreps.dual import ETA_LEAST, DualProblem, effective_sample_size, standardise
-from kreps.embedding import FeatureRegression, KernelEmbedding, LeaveOneOut, RegressionSums
-from kreps.hyperparameters import Prior, minimise
-from kreps.kernels import Kernel, SquaredExponential
-from kreps.policies import StochasticPolicy
+from kreps.models.world_model import Outlook
+from kreps.policies import cost_sensitive_gp as policies
+from kreps.policies.base import StochasticPolicy
+from kreps.policies.sparse_gp import PolicySums, SparseGP
 from kreps.settings import Settings, settings_of
-from kreps.sparse_gp import PolicySums, SparseGP
-from kreps.value import Basis, RKHSBasis
 
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
 
@@ -456,7 +462,7 @@ def test_a_set_of_samples_is_learnt_from_in_one_step(monkeypatch: pytest.MonkeyP
     def never(*arguments: Any) -> None:
         raise AssertionError("nothing is imagined of a set")
 
-    monkeypatch.setattr(low_rank_reps, "imagine", never)
+    monkeypatch.setattr(low_rank, "imagine", never)
     _, info = updated(Dataset.of(pushes()))
     assert len(info.dual.weights) == info.samples == 120
     with pytest.raises(AssertionError, match="imagined"):
@@ -472,14 +478,14 @@ def test_a_sample_says_what_it_would_say_if_all_samples_were_like_it(
         return numbers[: len(numbers) // copies]
 
     outlooks: list[Outlook] = []
-    draw = low_rank_reps.imagine
+    draw = low_rank.imagine
 
     def watch(outlook: Outlook, *others: Any) -> Any:
         outlooks.append(outlook)
         return draw(outlook, *others)
 
-    monkeypatch.setattr(low_rank_reps, "some", every_fourth)
-    monkeypatch.setattr(low_rank_reps, "imagine", watch)
+    monkeypatch.setattr(low_rank, "some", every_fourth)
+    monkeypatch.setattr(low_rank, "imagine", watch)
     fits: list[tuple[RegressionSums, float]] = []
     fit = FeatureRegression.fit
 
@@ -506,7 +512,7 @@ def test_no_outlook_is_made_where_nothing_is_imagined(
     def never(*arguments: Any, **named: Any) -> None:
         raise AssertionError("an outlook")
 
-    monkeypatch.setattr(low_rank_reps, "Outlook", never)
+    monkeypatch.setattr(low_rank, "Outlook", never)
     _, info = updated(pushes(), approximation="pivoted", **settings)
     assert len(info.dual.weights) == info.samples
 
@@ -515,7 +521,7 @@ def test_no_outlook_is_made_where_nothing_is_imagined(
 def test_each_step_begins_with_v_of_the_one_before_and_a_temperature_anew(
     approximation: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module: Any = reps if approximation == "exact" else low_rank_reps
+    module: Any = reps if approximation == "exact" else low_rank
     solved: list[tuple[Any, Any, Any]] = []
     drawn: list[tuple[FloatArray, StochasticPolicy]] = []
     solve, draw = module.solve_dual, module.imagine
@@ -635,7 +641,7 @@ def test_the_deviation_of_a_policy_can_be_less_and_its_mean_the_same() -> None:
 def test_actions_are_imagined_wider_and_then_taken_narrower(
     approximation: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    module: Any = reps if approximation == "exact" else low_rank_reps
+    module: Any = reps if approximation == "exact" else low_rank
     drawn: list[FloatArray] = []
     spreads: list[float] = []
     of_imagined = PolicySamples.imagined
@@ -713,9 +719,7 @@ def test_clipping_is_told_of_the_new_rollouts(approximation: str) -> None:
     if approximation == "exact":
         _, again = reps.update(learner.state, [], TASK, learner.settings, rng)
     else:
-        _, again = low_rank_reps.update(
-            learner.state, [], TASK, learner.settings, rng, learner.compute
-        )
+        _, again = low_rank.update(learner.state, [], TASK, learner.settings, rng, learner.compute)
     assert again.clipped == share_clipped(kept, TASK) < 0.5
 
 

@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from kreps.arrays import FloatArray
-from kreps.kernels import (
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.gram import gaussian_gram
+from kreps.kernels.kernel import (
     Kernel,
     Periodic,
     SquaredExponential,
     factors_of,
-    gaussian_gram,
     median_lengthscales,
     pivots_of,
     squared_distances,

@@ -14,13 +14,15 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 import kreps
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, DataError
-from kreps.evaluation import Greedy, evaluate
-from kreps.learner import IterationReport
-from kreps.policies import BangBang, Gaussian, StochasticPolicy
-from kreps.rollout import collect
+from kreps.kernels.arrays import FloatArray
+from kreps.learning.collect import collect
+from kreps.learning.evaluate import Greedy, evaluate
+from kreps.learning.learner import IterationReport
+from kreps.policies.base import StochasticPolicy
+from kreps.policies.exploration import BangBang, Gaussian
 
 TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 STATES = np.stack([np.linspace(-1.5, 4.5, 7), np.linspace(-6.0, 6.0, 7)], axis=1)

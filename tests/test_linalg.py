@@ -7,16 +7,10 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from kreps.arrays import FloatArray, IntArray
 from kreps.errors import NumericalError
-from kreps.linalg import (
-    PivotedCholesky,
-    cholesky,
-    pivoted_cholesky,
-    solve_lower,
-    solve_lower_transposed,
-    with_diagonal,
-)
+from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.kernels.linalg import cholesky, solve_lower, solve_lower_transposed, with_diagonal
+from kreps.kernels.pivoted_cholesky import PivotedCholesky, pivoted_cholesky
 
 
 def positive_definite(n: int, seed: int) -> FloatArray:

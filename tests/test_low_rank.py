@@ -14,35 +14,25 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps import dataset as dataset_module
-from kreps import embedding, policies
-from kreps.algorithms import low_rank_reps
-from kreps.algorithms.chunk_sums import StreamedProblem
-from kreps.algorithms.reps import (
-    DROPPED_WEIGHT,
-    PolicySamples,
-    UpdateInfo,
-    policy_hyperparameters,
-)
-from kreps.arrays import FloatArray, IntArray
-from kreps.compute import Compute
-from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.dataset import Dataset
-from kreps.dual import (
-    GAP_TOLERANCE,
-    KL_TOLERANCE,
-    DualProblem,
-    DualSolution,
-    Outcome,
-    kl_from_uniform,
-    solve_dual,
-)
+from kreps.algorithms import low_rank
+from kreps.algorithms.dual import DualProblem, DualSolution, Outcome, kl_from_uniform
+from kreps.algorithms.newton import GAP_TOLERANCE, KL_TOLERANCE, solve_dual
+from kreps.algorithms.reps import DROPPED_WEIGHT, PolicySamples, UpdateInfo, policy_hyperparameters
+from kreps.algorithms.streaming import StreamedProblem
+from kreps.data import dataset as dataset_module
+from kreps.data.compute import Compute
+from kreps.data.dataset import Dataset
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError
-from kreps.policies import BangBang
-from kreps.rollout import collect
+from kreps.kernels import regression as embedding
+from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.kernels.basis import FourierExpansion, KernelExpansion
+from kreps.learning.collect import collect
+from kreps.policies import cost_sensitive_gp as policies
+from kreps.policies.exploration import BangBang
+from kreps.policies.sparse_gp import SparseGP
 from kreps.settings import Settings
-from kreps.sparse_gp import SparseGP
-from kreps.value import FourierExpansion, KernelExpansion
 
 TASK = TaskSpec(2, [-30.0], [30.0], (0,))  # type: ignore[arg-type]
 FULL: dict[str, Any] = {"basis_tolerance": 1e-9, "max_rank": 5000, "rank": 5000}
@@ -243,7 +233,7 @@ def short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def streamed(short_chunks: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Most samples are in no sample of them, so that the dual is solved in chunks."""
-    monkeypatch.setattr(low_rank_reps, "SAMPLE", 200)
+    monkeypatch.setattr(low_rank, "SAMPLE", 200)
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
@@ -280,8 +270,8 @@ def test_the_dual_in_chunks_is_that_in_memory(
         solved.append((problem, solve(problem, settings, sample, sampled)))
         return solved[-1][1]
 
-    solve = low_rank_reps.solve
-    monkeypatch.setattr(low_rank_reps, "solve", spy)
+    solve = low_rank.solve
+    monkeypatch.setattr(low_rank, "solve", spy)
     settings = LOW | VARIANTS[variant]
     _, info = updated(rollouts, approximation="pivoted", **settings)
     [(problem, found)] = solved
@@ -311,14 +301,14 @@ def test_the_dual_grows_from_part_to_part(
     rollouts: list[Rollout], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each part is solved with the ridge of the next, and the next begins where it ended."""
-    monkeypatch.setattr(low_rank_reps, "SAMPLE", 40)
+    monkeypatch.setattr(low_rank, "SAMPLE", 40)
     solved: list[tuple[Any, Any, DualSolution]] = []
 
     def spy(problem: Any, *, start: Any = None) -> DualSolution:
         solved.append((problem, start, solve_dual(problem, start=start)))
         return solved[-1][2]
 
-    monkeypatch.setattr(low_rank_reps, "solve_dual", spy)
+    monkeypatch.setattr(low_rank, "solve_dual", spy)
     learner, info = updated(rollouts, approximation="pivoted", **LOW)
     sizes = [len(problem.rewards) for problem, _, _ in solved]
     assert sizes[0] == 40 and 40 < sizes[1] < 345 and sizes[2:] == [345]
@@ -343,7 +333,7 @@ def test_the_dual_of_all_samples_starts_from_the_solution_for_some(
         ends.append(solve_dual(problem, start=start))
         return ends[-1]
 
-    monkeypatch.setattr(low_rank_reps, "solve_dual", spy)
+    monkeypatch.setattr(low_rank, "solve_dual", spy)
     _, info = updated(rollouts, approximation="pivoted", **LOW)
     assert starts[0] is None
     assert starts[1][0] == ends[0].eta and starts[1][1] is ends[0].theta
@@ -364,7 +354,7 @@ def test_the_prior_of_the_policy_is_weighed_against_all_samples(
         seen.append(samples)
         return policy_hyperparameters(samples, *others)
 
-    monkeypatch.setattr(low_rank_reps, "policy_hyperparameters", spy)
+    monkeypatch.setattr(low_rank, "policy_hyperparameters", spy)
     _, info = updated(rollouts, approximation="pivoted", **LOW)
     weights = info.dual.weights / np.sum(info.dual.weights**2)
     kept = 345 * info.dual.weights >= DROPPED_WEIGHT
@@ -442,7 +432,7 @@ def test_a_set_of_the_same_rollouts_gives_the_same_policy(rollouts: list[Rollout
 def test_auto_is_exact_up_to_its_limit(
     limit: int, low_rank: bool, rollouts: list[Rollout], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(low_rank_reps, "EXACT_LIMIT", limit)
+    monkeypatch.setattr(low_rank, "EXACT_LIMIT", limit)
     learner, _ = updated(rollouts[:3], **LOW)
     assert not isinstance(learner.policy.process, SparseGP)
     learner.update(rollouts[3:])  # what is kept counts too
@@ -452,7 +442,7 @@ def test_auto_is_exact_up_to_its_limit(
 def test_an_exact_update_is_never_approximated(
     rollouts: list[Rollout], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(low_rank_reps, "EXACT_LIMIT", 10)
+    monkeypatch.setattr(low_rank, "EXACT_LIMIT", 10)
     learner, _ = updated(rollouts, approximation="exact")
     assert not isinstance(learner.policy.process, SparseGP)
     with pytest.raises(ConfigurationError, match="exact"):
@@ -500,9 +490,7 @@ def test_a_set_is_counted_but_not_kept(rollouts: list[Rollout]) -> None:
 def test_no_new_rollouts_are_learnt_from_when_old_ones_are_kept(rollouts: list[Rollout]) -> None:
     learner, _ = updated(rollouts, approximation="pivoted", **LOW)
     rng = np.random.default_rng(0)
-    state, info = low_rank_reps.update(
-        learner.state, [], TASK, learner.settings, rng, learner.compute
-    )
+    state, info = low_rank.update(learner.state, [], TASK, learner.settings, rng, learner.compute)
     assert info.samples == 345
     assert (state.iteration, state.rollouts, state.steps) == (2, 6, 345)
     assert learner.state.iteration == 1
@@ -521,7 +509,7 @@ def test_fits_start_where_those_of_the_last_update_ended(
         return spied
 
     for name, place in (("embedding_hyperparameters", 4), ("policy_hyperparameters", 3)):
-        monkeypatch.setattr(low_rank_reps, name, spy(getattr(low_rank_reps, name), place))
+        monkeypatch.setattr(low_rank, name, spy(getattr(low_rank, name), place))
     learner, _ = updated(rollouts, approximation="pivoted", **LOW)
     ends = [learner.state.embedding_start, learner.state.policy_start]
     learner.update(rollouts[:1])

@@ -13,17 +13,17 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import kreps.evaluation
 import numpy as np
 import pytest
 
-import kreps.evaluation
 from kreps.algorithms import npalp, reps, value_iteration
-from kreps.algorithms.imagined_step import MOST_IMAGINED
+from kreps.algorithms.generated import MOST_IMAGINED
 from kreps.experiments.search import CANDIDATES
 from kreps.experiments.specs import FIGURES, METHODS
-from kreps.kernels import IMAGE_BLUR
-from kreps.learner import LEARNERS, IterationReport, Learner
-from kreps.policies import MAX_SUPPORT
+from kreps.kernels.kernel import IMAGE_BLUR
+from kreps.learning.learner import LEARNERS, IterationReport, Learner
+from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 from kreps.settings import RECIPES, Settings
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -10,18 +10,21 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec
-from kreps.errors import (
-    ConfigurationError,
-    DataError,
-    EnvironmentFailure,
-    SpaceError,
-    StorageError,
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
+from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError, StorageError
+from kreps.kernels.arrays import FloatArray
+from kreps.learning.evaluate import Greedy, evaluate
+from kreps.learning.learner import (
+    KREPS,
+    LEARNERS,
+    NPALP,
+    GridValueIteration,
+    Learner,
+    ValueIteration,
 )
-from kreps.evaluation import Greedy, evaluate
-from kreps.learner import KREPS, LEARNERS, NPALP, GridValueIteration, Learner, ValueIteration
-from kreps.policies import BangBang, Gaussian, StochasticPolicy
+from kreps.policies.base import StochasticPolicy
+from kreps.policies.exploration import BangBang, Gaussian
 
 P = 0.1
 TASK = TaskSpec(1, [-2.0], [2.0])

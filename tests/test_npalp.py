@@ -15,11 +15,13 @@ from scipy.spatial.distance import cdist
 from kreps.algorithms import npalp
 from kreps.algorithms.npalp import sample_bounds
 from kreps.algorithms.state import LearnerState
-from kreps.arrays import FloatArray, IntArray
-from kreps.data import Rollout, TaskSpec, Transitions, Window
-from kreps.kernels import Kernel
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.data.window import Window
+from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.kernels.kernel import Kernel
+from kreps.policies.value_based import LipschitzPolicy
 from kreps.settings import NPALPSettings
-from kreps.value_policies import LipschitzPolicy
 
 TASK = TaskSpec(2, [-2.0, 0.0], [2.0, 10.0], periodic=(0,))
 

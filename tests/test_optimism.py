@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.algorithms.imagined_rollouts import Followed
-from kreps.algorithms.imagined_step import Outlook, imagine
-from kreps.algorithms.optimism import HIGHEST, KEPT, LEAST, Optimism, known_distance, optimism_of
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.kernels import Kernel
+from kreps.algorithms.generated import imagine
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import Kernel
+from kreps.models.model_env import Followed
+from kreps.models.novelty import HIGHEST, KEPT, LEAST, Optimism, known_distance, optimism_of
+from kreps.models.world_model import Outlook
 
 TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
 KERNEL = Kernel(TASK.state_factors, np.array([0.5, 2.0]))

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.data import TaskSpec
-from kreps.kernels import Kernel, factors_of
-from kreps.policies import CostSensitiveGP
+from kreps.data.task import TaskSpec
+from kreps.kernels.kernel import Kernel, factors_of
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 
 LAZY = ("matplotlib", "PIL", "rich", "typer", "scipy", "pandas", "torch")
 

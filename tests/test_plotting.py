@@ -13,8 +13,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 import kreps
-from kreps import plotting
-from kreps.data import Rollout, TaskSpec
+from kreps.app import plots as plotting
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import ConfigurationError
 

@@ -9,14 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kreps.arrays import FloatArray
-from kreps.controller import Policy, mean_difference
-from kreps.data import TaskSpec
+from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError
-from kreps.kernels import Kernel, factors_of
-from kreps.policies import MAX_SUPPORT, NEGLIGIBLE, BangBang, CostSensitiveGP, Gaussian
-from kreps.sparse_gp import SparseGP
-from kreps.value_policies import LipschitzPolicy, SoftmaxPolicy
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import Kernel, factors_of
+from kreps.learning.policy import Policy, mean_difference
+from kreps.policies.cost_sensitive_gp import MAX_SUPPORT, NEGLIGIBLE, CostSensitiveGP
+from kreps.policies.exploration import BangBang, Gaussian
+from kreps.policies.sparse_gp import SparseGP
+from kreps.policies.value_based import LipschitzPolicy, SoftmaxPolicy
 
 TASK = TaskSpec(2, np.array([-1.0, 10.0]), np.array([1.0, 30.0]))
 KERNEL = Kernel(factors_of(2), np.array([0.8, 1.3]))

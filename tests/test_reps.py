@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from kreps.algorithms import reps, transition_model
-from kreps.algorithms.boldness import ETA_FLOOR_NOT_JUDGED
+from kreps.algorithms import reps
+from kreps.algorithms.acceptance import ETA_FLOOR_NOT_JUDGED
+from kreps.algorithms.dual import DualProblem, Outcome, kl_from_uniform
+from kreps.algorithms.newton import KL_TOLERANCE, solve_dual
 from kreps.algorithms.reps import (
     DROPPED_WEIGHT,
     LearnerState,
@@ -19,17 +21,15 @@ from kreps.algorithms.reps import (
     policy_hyperparameters,
     update,
 )
-from kreps.algorithms.transition_model import (
-    feature_differences,
-    restart_features,
-    successor_features,
-)
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Transitions, Window
-from kreps.dual import KL_TOLERANCE, DualProblem, Outcome, kl_from_uniform, solve_dual
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.data.window import Window
 from kreps.errors import DataError
-from kreps.hyperparameters import TOLERANCE, PolicyLoss, Prior, factor_distances, minimise
-from kreps.kernels import Kernel, factors_of
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.hyperparameters import TOLERANCE, PolicyLoss, Prior, factor_distances, minimise
+from kreps.kernels.kernel import Kernel, factors_of
+from kreps.models import transition as transition_model
+from kreps.models.transition import feature_differences, restart_features, successor_features
 from kreps.settings import Settings, settings_of
 
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.learner import IterationReport
-from kreps.runs import RunConfig, RunFolder
+from kreps.app.run_folder import RunConfig, RunFolder
+from kreps.learning.learner import IterationReport
 
 TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 NAME = "kreps/SwingUp-v0"

@@ -11,15 +11,17 @@ import pytest
 
 import kreps
 from kreps.algorithms.reps import LearnerState
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
 from kreps.envs.restart import stratified_lengths
 from kreps.envs.swing_up import SwingUp
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
-from kreps.evaluation import discounted_average
-from kreps.exploration import RED
-from kreps.policies import BangBang, StochasticPolicy
-from kreps.rollout import batch_model_of, collect, simulate, task_of, without_restarts
+from kreps.kernels.arrays import FloatArray
+from kreps.learning.collect import collect, simulate
+from kreps.learning.environment import batch_model_of, task_of, without_restarts
+from kreps.learning.evaluate import discounted_average
+from kreps.policies.base import StochasticPolicy
+from kreps.policies.exploration import RED, BangBang
 from kreps.seeding import Purpose, generator, integer_seed
 
 TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kreps.arrays import FloatArray
-from kreps.data import TaskSpec
+from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError
-from kreps.kernels import Kernel, factors_of, gaussian_gram
-from kreps.policies import CostSensitiveGP
-from kreps.sparse_gp import ROWS, PolicySums, SparseGP
-from kreps.value import RKHSBasis
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.basis import RKHSBasis
+from kreps.kernels.gram import gaussian_gram
+from kreps.kernels.kernel import Kernel, factors_of
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
+from kreps.policies.sparse_gp import ROWS, PolicySums, SparseGP
 
 TASK = TaskSpec(2, np.array([-1.0, 10.0]), np.array([1.0, 30.0]))
 CENTRE, SCALE = np.array([0.0, 20.0]), np.array([1.0, 10.0])

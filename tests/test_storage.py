@@ -23,16 +23,16 @@ import safetensors
 import safetensors.numpy
 
 import kreps
-from kreps import storage
 from kreps.algorithms.state import LearnerState
-from kreps.data import TaskSpec
+from kreps.data.task import TaskSpec
 from kreps.errors import StorageError
-from kreps.kernels import Kernel
-from kreps.learner import LEARNERS, Learner
-from kreps.policies import MAX_SUPPORT
-from kreps.sparse_gp import SparseGP
-from kreps.storage import POLICIES_OF_METHOD
-from kreps.value_policies import LipschitzPolicy
+from kreps.kernels.kernel import Kernel
+from kreps.learning import storage
+from kreps.learning.learner import LEARNERS, Learner
+from kreps.learning.storage import POLICIES_OF_METHOD
+from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
+from kreps.policies.sparse_gp import SparseGP
+from kreps.policies.value_based import LipschitzPolicy
 
 TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 SETTINGS: dict[str, dict[str, Any]] = {

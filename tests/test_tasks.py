@@ -11,16 +11,17 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import kreps
-from kreps.arrays import FloatArray
 from kreps.envs import reaching
 from kreps.envs.image_swing_up import PIXELS, ImageSwingUpBatch, image
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.envs.swing_up import SwingUpBatch
 from kreps.errors import ConfigurationError
-from kreps.evaluation import evaluate
-from kreps.kernels import Periodic, SquaredExponential
-from kreps.policies import Gaussian
-from kreps.rollout import batch_model_of, simulate, task_of
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import Periodic, SquaredExponential
+from kreps.learning.collect import simulate
+from kreps.learning.environment import batch_model_of, task_of
+from kreps.learning.evaluate import evaluate
+from kreps.policies.exploration import Gaussian
 
 NAMES = ["kreps/Reaching-v0", "kreps/ImageSwingUp-v0"]
 TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}

@@ -5,20 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kreps.algorithms import transition_model
-from kreps.algorithms.transition_model import (
-    FIT_SAMPLE,
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.hyperparameters import EmbeddingLoss, Prior
+from kreps.kernels.sampling import FIT_SAMPLE, evidence, inclusion, telling_rows
+from kreps.models import transition as transition_model
+from kreps.models.transition import (
     embedding_hyperparameters,
-    evidence,
     fit_regression,
-    inclusion,
     state_actions,
     state_kernel,
-    telling_rows,
 )
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.hyperparameters import EmbeddingLoss, Prior
 
 TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
 

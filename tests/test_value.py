@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kreps.arrays import FloatArray
 from kreps.errors import ConfigurationError
-from kreps.kernels import Kernel, factors_of
-from kreps.value import MAX_CENTRES, Basis, FourierBasis, RBFGrid, RKHSBasis
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.basis import MAX_CENTRES, Basis, FourierBasis, RBFGrid, RKHSBasis
+from kreps.kernels.kernel import Kernel, factors_of
 
 KERNEL = Kernel(factors_of(2, periodic=(0,)), np.array([1.0, 1.5]))
 

@@ -11,20 +11,24 @@ import pytest
 import scipy.stats
 
 import kreps
-from kreps.algorithms import transition_model, value_iteration
+from kreps.algorithms import value_iteration
+from kreps.algorithms.dual import standardise
 from kreps.algorithms.state import LearnerState
 from kreps.algorithms.value_iteration import TOLERANCE, candidate_actions, iterate_values
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Transitions, Window
-from kreps.dual import standardise
-from kreps.embedding import KernelEmbedding
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.data.window import Window
 from kreps.envs.swing_up import reward, wrap_angle
 from kreps.errors import ConfigurationError, SpaceError
-from kreps.hyperparameters import Prior, minimise
-from kreps.kernels import Kernel, SquaredExponential
-from kreps.rollout import collect_grid, task_of
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.hyperparameters import Prior, minimise
+from kreps.kernels.kernel import Kernel, SquaredExponential
+from kreps.kernels.regression import KernelEmbedding
+from kreps.learning.collect import collect_grid
+from kreps.learning.environment import task_of
+from kreps.models import transition as transition_model
+from kreps.policies.value_based import SoftmaxPolicy, soft_maximum
 from kreps.settings import ValueIterationSettings
-from kreps.value_policies import SoftmaxPolicy, soft_maximum
 
 TASK = TaskSpec(2, [-2.0], [6.0], periodic=(0,))
 

@@ -22,20 +22,21 @@ from kreps.errors import (
 )
 
 if TYPE_CHECKING:
-    from kreps.compute import Compute
-    from kreps.controller import Policy, load_policy
-    from kreps.data import Rollout, TaskSpec
-    from kreps.dataset import Dataset
+    from kreps.data.compute import Compute
+    from kreps.data.dataset import Dataset
+    from kreps.data.rollout import Rollout
+    from kreps.data.task import TaskSpec
     from kreps.envs.restart import RandomRestart
-    from kreps.learner import (
+    from kreps.learning.learner import (
         KREPS,
         NPALP,
         GridValueIteration,
         IterationReport,
         ValueIteration,
     )
+    from kreps.learning.policy import Policy, load_policy
+    from kreps.learning.storage import load_rollouts, rollout_folder, save_rollouts
     from kreps.settings import RECIPES, Settings
-    from kreps.storage import load_rollouts, rollout_folder, save_rollouts
 
 __all__ = [
     "KREPS",
@@ -69,23 +70,23 @@ __version__ = "0.1.0"
 # SciPy and the learner are loaded when first asked for: importing kreps to have its environments
 # registered should cost little more than importing Gymnasium.
 _HOMES = {
-    "KREPS": "learner",
-    "ValueIteration": "learner",
-    "GridValueIteration": "learner",
-    "NPALP": "learner",
-    "IterationReport": "learner",
-    "Policy": "controller",
-    "load_policy": "controller",
+    "KREPS": "learning.learner",
+    "ValueIteration": "learning.learner",
+    "GridValueIteration": "learning.learner",
+    "NPALP": "learning.learner",
+    "IterationReport": "learning.learner",
+    "Policy": "learning.policy",
+    "load_policy": "learning.policy",
     "RandomRestart": "envs.restart",
     "RECIPES": "settings",
     "Settings": "settings",
-    "Compute": "compute",
-    "Dataset": "dataset",
-    "load_rollouts": "storage",
-    "rollout_folder": "storage",
-    "save_rollouts": "storage",
-    "Rollout": "data",
-    "TaskSpec": "data",
+    "Compute": "data.compute",
+    "Dataset": "data.dataset",
+    "load_rollouts": "learning.storage",
+    "rollout_folder": "learning.storage",
+    "save_rollouts": "learning.storage",
+    "Rollout": "data.rollout",
+    "TaskSpec": "data.task",
 }
 
 

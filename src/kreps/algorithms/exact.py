@@ -7,7 +7,8 @@ from functools import partial
 
 import numpy as np
 
-from kreps.algorithms.dynamics import fit_dynamics, observed_expectation
+from kreps.algorithms.dual import DualProblem, DualSolution, standardise
+from kreps.algorithms.newton import solve_dual
 from kreps.algorithms.reps import (
     Expectation,
     PolicyFit,
@@ -18,20 +19,21 @@ from kreps.algorithms.reps import (
     stationarity_ridge,
 )
 from kreps.algorithms.state import LearnerState, Stopwatch
-from kreps.algorithms.transition_model import (
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.basis import RBFGrid, RKHSBasis
+from kreps.kernels.kernel import Kernel
+from kreps.models.dynamics import fit_dynamics, observed_expectation
+from kreps.models.transition import (
     feature_differences,
     fit_embedding,
     fit_regression,
     restart_features,
     with_cuts,
 )
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec
-from kreps.dual import DualProblem, DualSolution, solve_dual, standardise
-from kreps.kernels import Kernel
-from kreps.policies import MAX_SUPPORT, CostSensitiveGP
+from kreps.policies.cost_sensitive_gp import MAX_SUPPORT, CostSensitiveGP
 from kreps.settings import Settings
-from kreps.value import RBFGrid, RKHSBasis
 
 
 class ExactBatch:

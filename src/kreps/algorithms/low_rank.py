@@ -9,7 +9,20 @@ from operator import add
 
 import numpy as np
 
-from kreps.algorithms.chunk_sums import (
+from kreps.algorithms.dual import DualProblem, DualSolution, effective_sample_size, standardise
+from kreps.algorithms.newton import solve_dual
+from kreps.algorithms.reps import (
+    DROPPED_WEIGHT,
+    Expectation,
+    PolicyFit,
+    PolicySamples,
+    ValueFeatures,
+    drawn_noise,
+    policy_hyperparameters,
+    stationarity_ridge,
+)
+from kreps.algorithms.state import LearnerState, Stopwatch
+from kreps.algorithms.streaming import (
     BellmanRows,
     ChunkPolicySums,
     ChunkRewards,
@@ -23,36 +36,25 @@ from kreps.algorithms.chunk_sums import (
     StreamedProblem,
     Successors,
 )
-from kreps.algorithms.dynamics import Dynamics, Motion, after_ends, observed_expectation
-from kreps.algorithms.reps import (
-    DROPPED_WEIGHT,
-    Expectation,
-    PolicyFit,
-    PolicySamples,
-    ValueFeatures,
-    drawn_noise,
-    policy_hyperparameters,
-    stationarity_ridge,
-)
-from kreps.algorithms.state import LearnerState, Stopwatch
-from kreps.algorithms.transition_model import (
+from kreps.data.compute import Compute
+from kreps.data.dataset import Chunk, Dataset
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import FloatArray, IntArray, as_float
+from kreps.kernels.basis import Basis, FourierBasis, RBFGrid, RKHSBasis
+from kreps.kernels.kernel import Kernel
+from kreps.kernels.regression import FeatureRegression, LeaveOneOut, RegressionSums
+from kreps.models.dynamics import Dynamics, Motion, after_ends, observed_expectation
+from kreps.models.transition import (
     embedding_hyperparameters,
     feature_differences,
     restart_features,
     state_actions,
     with_cuts,
 )
-from kreps.arrays import FloatArray, IntArray, as_float
-from kreps.compute import Compute
-from kreps.data import Rollout, TaskSpec
-from kreps.dataset import Chunk, Dataset
-from kreps.dual import DualProblem, DualSolution, effective_sample_size, solve_dual, standardise
-from kreps.embedding import FeatureRegression, LeaveOneOut, RegressionSums
-from kreps.kernels import Kernel
-from kreps.policies import MAX_SUPPORT
+from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
+from kreps.policies.sparse_gp import PolicySums, SparseGP
 from kreps.settings import Settings
-from kreps.sparse_gp import PolicySums, SparseGP
-from kreps.value import Basis, FourierBasis, RBFGrid, RKHSBasis
 
 SAMPLE = 10_000
 GROWTH = 4

@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from kreps.algorithms.boldness import widening
-from kreps.algorithms.imagined_rollouts import Simulator, can_be_simulated
-from kreps.algorithms.imagined_step import Outlook, imagine, places
-from kreps.algorithms.judgement import refuses
-from kreps.algorithms.optimism import optimism_of
+from kreps.algorithms.acceptance import refuses, widening
+from kreps.algorithms.generated import imagine, places
+from kreps.algorithms.newton import solve_dual
 from kreps.algorithms.reps import Batch, PolicySamples, Step, stationarity_ridge
 from kreps.algorithms.state import LearnerState
-from kreps.algorithms.transition_model import restart_features
-from kreps.arrays import FloatArray
-from kreps.dual import solve_dual
-from kreps.exploration import each_tells, tells_of_states
+from kreps.data.rewards import each_tells, tells_of_states
+from kreps.kernels.arrays import FloatArray
+from kreps.models.model_env import Simulator, can_be_simulated
+from kreps.models.novelty import optimism_of
+from kreps.models.transition import restart_features
+from kreps.models.world_model import Outlook
 
 
 def generates_samples(batch: Batch) -> bool:

@@ -16,13 +16,14 @@ import numpy as np
 from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import spsolve
 
+from kreps.algorithms.dual import standardise
 from kreps.algorithms.state import LearnerState, Stopwatch
-from kreps.algorithms.transition_model import state_kernel
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec
-from kreps.dual import standardise
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import FloatArray
+from kreps.models.transition import state_kernel
+from kreps.policies.value_based import LipschitzPolicy
 from kreps.settings import NPALPSettings
-from kreps.value_policies import LipschitzPolicy
 
 MAX_IMPROVEMENTS = 1000
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from kreps.arrays import FloatArray
-from kreps.dual import DualSolution, Outcome
+from kreps.algorithms.dual import DualSolution, Outcome
+from kreps.kernels.arrays import FloatArray
 
 _NOTES = {
     Outcome.AT_FLOOR: "eta at its floor",

@@ -9,19 +9,22 @@ from typing import Protocol
 
 import numpy as np
 
-from kreps.algorithms.dynamics import Dynamics
-from kreps.algorithms.imagined_step import ImaginedSamples
+from kreps.algorithms.dual import DualSolution, Problem, effective_sample_size
+from kreps.algorithms.generated import ImaginedSamples
 from kreps.algorithms.state import LearnerState, Stopwatch
-from kreps.algorithms.transition_model import random_rows, state_kernel
-from kreps.arrays import FloatArray, IntArray
-from kreps.data import TaskSpec, Transitions, Window
-from kreps.dual import DualSolution, Problem, effective_sample_size
-from kreps.embedding import LeaveOneOut
-from kreps.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
-from kreps.kernels import Kernel
-from kreps.policies import LearntPolicy
+from kreps.data.rollout import Transitions
+from kreps.data.task import TaskSpec
+from kreps.data.window import Window
+from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.kernels.basis import Basis
+from kreps.kernels.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
+from kreps.kernels.kernel import Kernel
+from kreps.kernels.regression import LeaveOneOut
+from kreps.kernels.sampling import random_rows
+from kreps.models.dynamics import Dynamics
+from kreps.models.transition import state_kernel
+from kreps.policies.base import LearntPolicy
 from kreps.settings import Settings
-from kreps.value import Basis
 
 DROPPED_WEIGHT = 0.05
 """Samples with ``n p_i`` below this do not enter the policy: they say next to nothing."""

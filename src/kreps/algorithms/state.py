@@ -7,12 +7,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from kreps.arrays import FloatArray
-from kreps.data import Rollout, TaskSpec, Transitions, Window
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.data.window import Window, extended
 from kreps.errors import ConfigurationError, DataError
-from kreps.exploration import extended
-from kreps.policies import MAX_SUPPORT, LearntPolicy
-from kreps.value import LinearFunction
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.basis import LinearFunction
+from kreps.policies.base import LearntPolicy
+from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 
 
 @dataclass(frozen=True)

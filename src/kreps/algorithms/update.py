@@ -6,17 +6,18 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kreps.algorithms.boldness import least_temperature
+from kreps.algorithms.acceptance import least_temperature
+from kreps.algorithms.dual import effective_sample_size
 from kreps.algorithms.exact import ExactBatch
 from kreps.algorithms.low_rank import LowRankBatch
 from kreps.algorithms.model_based import can_simulate, generates_samples, model_based_step
 from kreps.algorithms.report import UpdateInfo
 from kreps.algorithms.reps import Batch, Step, reps_step, stationarity_ridge
 from kreps.algorithms.state import LearnerState, Stopwatch
-from kreps.compute import Compute
-from kreps.data import Rollout, TaskSpec
-from kreps.dataset import Dataset
-from kreps.dual import effective_sample_size
+from kreps.data.compute import Compute
+from kreps.data.dataset import Dataset
+from kreps.data.rollout import Rollout
+from kreps.data.task import TaskSpec
 from kreps.settings import Settings
 
 EXACT_LIMIT = 3_000

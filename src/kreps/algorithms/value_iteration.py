@@ -12,16 +12,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kreps.algorithms.dual import standardise
 from kreps.algorithms.state import LearnerState, Stopwatch
-from kreps.algorithms.transition_model import fit_embedding, state_kernel, successor_features
-from kreps.arrays import FloatArray, grid_points
-from kreps.data import Rollout, TaskSpec, Transitions
-from kreps.dual import standardise
-from kreps.embedding import KernelEmbedding
+from kreps.data.rollout import Rollout, Transitions
+from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError
+from kreps.kernels.arrays import FloatArray, grid_points
+from kreps.kernels.basis import RKHSBasis
+from kreps.kernels.regression import KernelEmbedding
+from kreps.models.transition import fit_embedding, state_kernel, successor_features
+from kreps.policies.value_based import SoftmaxPolicy, soft_maximum
 from kreps.settings import GridValueIterationSettings, Settings, ValueIterationSettings
-from kreps.value import RKHSBasis
-from kreps.value_policies import SoftmaxPolicy, soft_maximum
 
 MAX_SWEEPS = 300
 """0.98^300 is 0.2 %: what is then left moves no action."""

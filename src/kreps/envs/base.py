@@ -8,8 +8,8 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from kreps.arrays import FloatArray, as_float
 from kreps.envs.batch import BatchModel
+from kreps.kernels.arrays import FloatArray, as_float
 
 
 class BatchEnvironment(gym.Env[FloatArray, FloatArray]):

@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 
-from kreps.arrays import BoolArray, FloatArray
+from kreps.kernels.arrays import BoolArray, FloatArray
 
 
 class BatchModel(Protocol):

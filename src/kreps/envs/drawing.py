@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kreps.arrays import FloatArray, as_float
+from kreps.kernels.arrays import FloatArray, as_float
 
 
 class Canvas:

@@ -9,9 +9,9 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from kreps.arrays import BoolArray, FloatArray
 from kreps.envs.base import BatchEnvironment
 from kreps.envs.swing_up import MAX_TORQUE, SwingUp, SwingUpBatch
+from kreps.kernels.arrays import BoolArray, FloatArray
 
 PIXELS = 20  # along each side
 EXTENT = 1.2  # m: the camera sees [-EXTENT, EXTENT]^2

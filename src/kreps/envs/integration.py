@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from kreps.arrays import FloatArray
+from kreps.kernels.arrays import FloatArray
 
 
 def runge_kutta(

@@ -9,10 +9,10 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from kreps.arrays import BoolArray, FloatArray
 from kreps.envs.base import BatchEnvironment
 from kreps.envs.drawing import Canvas
 from kreps.envs.integration import runge_kutta
+from kreps.kernels.arrays import BoolArray, FloatArray
 
 LINK = 0.5  # m, each
 MASS = 1.0  # kg, each link a uniform rod

@@ -21,20 +21,13 @@ from typing import Any
 
 import numpy as np
 
-from kreps.arrays import FloatArray
 from kreps.errors import StorageError
 from kreps.experiments.figures import named_rows
-from kreps.experiments.specs import (
-    ANY_STATE,
-    FEATURES,
-    KERNEL,
-    NPALP,
-    SAMPLE,
-    VALUES,
-)
+from kreps.experiments.specs import ANY_STATE, FEATURES, KERNEL, NPALP, SAMPLE, VALUES
 from kreps.experiments.tables import markdown
+from kreps.kernels.arrays import FloatArray
+from kreps.learning.storage import write_atomically
 from kreps.seeding import Purpose, generator
-from kreps.storage import write_atomically
 
 RESAMPLES = 9999
 

@@ -12,17 +12,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from kreps.app.run_folder import versions
 from kreps.envs.image_swing_up import PIXELS
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.envs.swing_up import TIME_STEP
-from kreps.experiments.cells import commits_of
 from kreps.experiments.specs import METHODS, TASKS
 from kreps.experiments.tables import markdown
-from kreps.policies import BangBang
-from kreps.rollout import simulate, task_of
-from kreps.runs import versions
+from kreps.experiments.trials import commits_of
+from kreps.learning.collect import simulate
+from kreps.learning.environment import task_of
+from kreps.learning.storage import write_atomically
+from kreps.policies.exploration import BangBang
 from kreps.seeding import Purpose, generator, integer_seed
-from kreps.storage import write_atomically
 
 
 def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -168,7 +169,7 @@ def write_figure(
     folder: Path, name: str, command: str, results: Sequence[Mapping[str, Any]]
 ) -> list[Path]:
     """The result files of a figure, and its picture."""
-    from kreps import plotting
+    from kreps.app import plots as plotting
 
     write_results(folder, name, command, results)
     rows = named_rows(rows_of(results))
@@ -192,7 +193,7 @@ def write_figure(
 
 def draw_features(path: Path) -> Path:
     """Fig. 2a: what the learner sees of a roll-out of its first policy."""
-    from kreps import plotting
+    from kreps.app import plots as plotting
 
     env = gym.make("kreps/ImageSwingUp-v0")
     task = task_of(env)

@@ -17,10 +17,10 @@ from rich.progress import (
 )
 
 from kreps.errors import CellFailure
-from kreps.evaluation import EPISODES
-from kreps.experiments.cells import Cell, cell_of, read_cell, run_cell, write_cell
 from kreps.experiments.search import tuned_options
 from kreps.experiments.specs import BEYOND, FIGURES, FIRST_SEED, TASKS
+from kreps.experiments.trials import Cell, cell_of, read_cell, run_cell, write_cell
+from kreps.learning.evaluate import EPISODES
 
 
 def figure_cells(figure: str, trials: int, iterations: int | None) -> list[Cell]:

@@ -19,18 +19,10 @@ from typing import Any
 import numpy as np
 
 from kreps.errors import StorageError
-from kreps.experiments.cells import Cell, cell_of, commits_of, name_of
-from kreps.experiments.specs import (
-    ANY_STATE,
-    FEATURES,
-    KERNEL,
-    METHODS,
-    NPALP,
-    SAMPLE,
-    VALUES,
-)
+from kreps.experiments.specs import ANY_STATE, FEATURES, KERNEL, METHODS, NPALP, SAMPLE, VALUES
 from kreps.experiments.tables import markdown
-from kreps.storage import write_atomically
+from kreps.experiments.trials import Cell, cell_of, commits_of, name_of
+from kreps.learning.storage import write_atomically
 
 SEEDS = (200, 201)
 ITERATIONS = 10

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Any
 
-from kreps.evaluation import EPISODES
+from kreps.learning.evaluate import EPISODES
 
 Options = Mapping[str, Any]
 

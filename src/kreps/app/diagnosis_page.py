@@ -1,0 +1,293 @@
+"""The diagnosis of a run on one page: curves against thresholds, and the findings in words."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure, SubFigure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import (
+    FuncFormatter,
+    LogLocator,
+    MaxNLocator,
+    NullFormatter,
+    PercentFormatter,
+)
+
+from kreps.app import diagnosis
+from kreps.app.diagnosis import Finding, Row, Severity, column
+from kreps.app.plots import BLUE, GREY, STYLE
+from kreps.errors import ConfigurationError
+
+COLOURS: dict[Severity, str] = {"limit": "#c0392b", "note": "#b07d10", "fine": "#2a8c7e"}
+PAGES = (".png", ".pdf", ".svg")
+WIDTH, HEIGHT, WORDS = 14.0, 8.8, 5.1
+"""Of the page and of its column of words, in inches."""
+
+PANELS: dict[str, tuple[str, ...]] = {
+    "Average reward per step, and its trend": ("goal", "local optimum", "progress", "judgement"),
+    "KL divergence [nats]": ("step",),
+    "Temperature eta [s.d. of the reward]": ("step", "updates"),
+    "Effective samples, share of all": ("effective samples",),
+    "Model: relative leave-one-out error": ("transition model",),
+    "Basis of V: features": ("basis of V",),
+    "Policy noise [half the action range]": ("exploration noise",),
+    "Commands beyond the limits": ("clipped actions",),
+}
+"""Headings in reading order, and the findings that each panel shows."""
+
+
+def check_page_name(path: Path) -> None:
+    """Raise `ConfigurationError` unless the name is that of a picture."""
+    if path.suffix not in PAGES:
+        raise ConfigurationError(
+            f"{path.name!r} is no page; end its name in {', '.join(PAGES[:-1])} or {PAGES[-1]}"
+        )
+
+
+def page(
+    rows: Sequence[Row], findings: Sequence[Finding], references: Mapping[str, float], title: str
+) -> Figure:
+    """Eight panels over the iterations beside the findings.
+
+    Args:
+        rows: of ``progress.csv``.
+        findings: of them, the gravest first.
+        references: reference rewards of the task by name, from best to worst.
+        title: of the page.
+    """
+    with rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH, HEIGHT))
+        engine = figure.get_layout_engine()
+        assert isinstance(engine, ConstrainedLayoutEngine)
+        engine.set(w_pad=0.12, h_pad=0.07)
+        halves: Any = figure.subfigures(1, 2, width_ratios=(WIDTH - WORDS, WORDS))
+        left, right = halves
+        plots = dict(zip(PANELS, left.subplots(4, 2, sharex=True).flat, strict=True))
+        reward, kl, eta, effective, model, basis, noise, clipped = plots.values()
+        _draw_reward(reward, rows, references)
+        _draw_kl(kl, rows)
+        _draw_eta(eta, rows)
+        _draw_effective_samples(effective, rows)
+        _draw_model(model, rows)
+        _draw_basis(basis, rows)
+        _draw_noise(noise, rows)
+        _draw_clipping(clipped, rows)
+        for name, axes in plots.items():
+            axes.set_title(name)
+            _mark(axes, [f.severity for f in findings if f.name in PANELS[name]])
+        for axes in (noise, clipped):
+            axes.set_xlabel("iteration")
+            axes.xaxis.set_major_locator(MaxNLocator(8, integer=True, min_n_ticks=1))
+        figure.suptitle(f"What limits this run: {title}", fontweight="bold", fontsize=12)
+        _write(right, findings)
+    return figure
+
+
+# ---- panels -----------------------------------------------------------------------------------
+
+
+def _mark(axes: Axes, severities: Sequence[Severity]) -> None:
+    """The gravest of some severities, above the panel on the right."""
+    for severity in COLOURS:
+        if severity in severities:
+            axes.set_title(f"● {severity}", loc="right", color=COLOURS[severity], fontsize=9)
+            return
+
+
+def _curve(axes: Axes, rows: Sequence[Row], values: Any, **style: Any) -> None:
+    """Over the iterations; a word where there is nothing to draw."""
+    if np.isfinite(values).any():
+        axes.plot(column(rows, "iteration"), values, "o-", color=BLUE, ms=3, lw=1.2, **style)
+    else:
+        axes.text(
+            0.5, 0.55, "none, or not recorded", transform=axes.transAxes, ha="center", color=GREY
+        )
+
+
+def _line(
+    axes: Axes,
+    value: float,
+    text: str,
+    colour: str = GREY,
+    *,
+    below: bool = False,
+    right: bool = False,
+) -> None:
+    """A threshold or a reference, named above its left end, or below it, or at the right one."""
+    axes.axhline(value, color=colour, lw=0.9, ls="--", zorder=0)
+    axes.annotate(
+        text,
+        (float(right), value),
+        xycoords=("axes fraction", "data"),
+        xytext=(-3 if right else 3, -2 if below else 1.5),
+        textcoords="offset points",
+        va="top" if below else "bottom",
+        ha="right" if right else "left",
+        color=colour,
+        fontsize=7,
+    )
+
+
+def _bad(axes: Axes, low: float, high: float, severity: Severity) -> None:
+    axes.axhspan(low, high, color=COLOURS[severity], alpha=0.07, lw=0, zorder=-1)
+
+
+def _plain_decades(axes: Axes) -> None:
+    """Ticks of a logarithmic axis as plain numbers, few of them."""
+    low, high = axes.get_ylim()
+    subs = (1.0, 3.0) if high < 1e3 * low else (1.0,)
+    axes.yaxis.set_major_locator(LogLocator(subs=subs, numticks=8))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+
+
+def _draw_reward(axes: Axes, rows: Sequence[Row], references: Mapping[str, float]) -> None:
+    values = column(rows, "average_reward")
+    _curve(axes, rows, values, label="training")
+    for name, value in list(references.items())[:-1]:  # named where the curve is not
+        _line(axes, value, f"{name}  {value:g}", right=value < values.mean())
+    found = diagnosis.improving(rows)
+    if found is not None:
+        time = column(rows, "iteration")[-found.iterations :]
+        middle = values[-found.iterations :].mean()
+        ends = middle + found.rise * np.array([-0.5, 0.5])
+        axes.plot(time[[0, -1]], ends, color="#222222", lw=1.4)
+    axes.margins(y=0.15)
+
+
+def _draw_kl(axes: Axes, rows: Sequence[Row]) -> None:
+    bound = column(rows, "kl_bound")
+    _curve(axes, rows, column(rows, "kl"))
+    top = float(bound.max())
+    _line(axes, float(bound[-1]), f"bound {bound[-1]:g}")
+    _line(axes, diagnosis.BOUND_UNUSED * float(bound[-1]), "half of it")
+    axes.set_ylim(0.0, 1.25 * top)
+
+
+def _draw_eta(axes: Axes, rows: Sequence[Row]) -> None:
+    _curve(axes, rows, column(rows, "eta"))
+    axes.set_yscale("log")
+    floor = diagnosis.latest(rows, "eta_floor")
+    low, high = float(column(rows, "eta").min()), float(column(rows, "eta").max())
+    if np.isfinite(floor):
+        _line(axes, floor, f"floor {floor:.2g}", below=True)
+        low = min(low, floor)
+    axes.set_ylim(low * (low / high / 4.0) ** 0.25, 2.0 * high)
+    _plain_decades(axes)
+
+
+def _draw_effective_samples(axes: Axes, rows: Sequence[Row]) -> None:
+    _curve(axes, rows, diagnosis.effective_share(rows))
+    targets = float(diagnosis.targets(rows)[-1])
+    least = max(diagnosis.LEAST_SHARE, diagnosis.LEAST_EFFECTIVE / targets)
+    severity: Severity = "note" if least == diagnosis.LEAST_SHARE else "limit"
+    text = f"{diagnosis.LEAST_SHARE:.0%}" if severity == "note" else "30 samples"
+    _line(axes, least, text, COLOURS[severity])
+    _bad(axes, 0.0, least, severity)
+    axes.set_ylim(0.0, 1.0)
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+
+
+def _draw_model(axes: Axes, rows: Sequence[Row]) -> None:
+    values = column(rows, "model_error")
+    _curve(axes, rows, values)
+    _line(axes, diagnosis.ERROR_NOTE, f"note {diagnosis.ERROR_NOTE:g}", COLOURS["note"], below=True)
+    _line(axes, diagnosis.ERROR_LIMIT, f"limit {diagnosis.ERROR_LIMIT:g}", COLOURS["limit"])
+    top = max(1.1, 1.1 * float(np.nanmax(values, initial=0.0)))
+    _bad(axes, diagnosis.ERROR_NOTE, diagnosis.ERROR_LIMIT, "note")
+    _bad(axes, diagnosis.ERROR_LIMIT, top, "limit")
+    axes.set_ylim(0.0, top)
+
+
+def _draw_basis(axes: Axes, rows: Sequence[Row]) -> None:
+    rank = column(rows, "rank")
+    _curve(axes, rows, rank)
+    cap = diagnosis.latest(rows, "max_rank")
+    top = float(rank.max())
+    if np.isfinite(cap):
+        _line(axes, cap, f"cap {cap:.0f}")
+        top = max(top, cap)
+    axes.set_ylim(0.0, 1.25 * top)
+    residual = diagnosis.latest(rows, "rank_residual")
+    fixed = diagnosis.recorded(rows) and not np.isfinite(cap)
+    axes.text(
+        0.99,
+        0.06,
+        "left out: not measured" if fixed else f"left out: {residual:.1g}",
+        transform=axes.transAxes,
+        ha="right",
+        color=GREY,
+        fontsize=7,
+    )
+
+
+def _draw_noise(axes: Axes, rows: Sequence[Row]) -> None:
+    values = column(rows, "policy_noise")
+    _curve(axes, rows, values)
+    least, most = diagnosis.NOISE_LEAST, diagnosis.NOISE_MOST
+    _line(axes, least, f"too still {least:g}", COLOURS["limit"])
+    _line(axes, most, f"wild {most:g}", COLOURS["note"])
+    known = values[np.isfinite(values)]
+    low = 0.5 * min([least, *known])
+    high = 2.5 * max([most, *known])
+    _bad(axes, low, least, "limit")
+    _bad(axes, most, high, "note")
+    axes.set_yscale("log")
+    axes.set_ylim(low, high)
+    _plain_decades(axes)
+
+
+def _draw_clipping(axes: Axes, rows: Sequence[Row]) -> None:
+    _curve(axes, rows, column(rows, "clipped"))
+    _line(
+        axes, diagnosis.CLIPPED_NOTE, f"{diagnosis.CLIPPED_NOTE:.0%}", COLOURS["note"], below=True
+    )
+    _bad(axes, diagnosis.CLIPPED_NOTE, 1.04, "note")
+    axes.set_ylim(0.0, 1.04)
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+
+
+# ---- words ------------------------------------------------------------------------------------
+
+
+def _write(side: SubFigure, findings: Sequence[Finding]) -> None:
+    """All findings below each other, in the largest letters for which they fit."""
+    room = 72.0 * (HEIGHT - 0.75)
+    for size in np.arange(9.5, 4.0, -0.25):
+        lines = _lines(findings, size)
+        if sum(skip for _, _, skip in lines) <= room:
+            break
+    y = 1.0
+    for text, style, skip in lines:
+        y -= skip / 72.0 / HEIGHT
+        side.text(0.03, y, text, fontsize=size, va="bottom", parse_math=False, **style)
+
+
+def _lines(findings: Sequence[Finding], size: float) -> list[tuple[str, dict[str, Any], float]]:
+    """Lines of text, their styles and how far each lies below the one before, in points."""
+    letters = int(72.0 * (WORDS - 0.4) / (0.535 * size))
+    lines: list[tuple[str, dict[str, Any], float]] = []
+    for finding in findings:
+        heading = f"{finding.severity.upper()}   {finding.name}"
+        bold = {"fontweight": "bold", "color": COLOURS[finding.severity]}
+        lines.append((heading, bold, 2.1 * size))
+        lines += [
+            (t, {"color": "#222222"}, 1.3 * size) for t in _wrapped(finding.sentence, letters)
+        ]
+        if finding.remedy:
+            remedy = _wrapped(f"Try: {finding.remedy}", letters)
+            lines += [(t, {"color": BLUE}, 1.3 * size) for t in remedy]
+    return lines
+
+
+def _wrapped(text: str, letters: int) -> list[str]:
+    """Lines of at most so many letters; an option stays in one line."""
+    text = text.replace("--set ", "--set\N{NO-BREAK SPACE}")
+    return textwrap.wrap(text, letters, break_on_hyphens=False)

@@ -1,0 +1,146 @@
+"""What is learnt from: the task's shape, roll-outs, the window kept of them, its transitions."""
+
+from __future__ import annotations
+
+import operator
+from dataclasses import dataclass
+
+import numpy as np
+
+from kreps.errors import ConfigurationError
+from kreps.kernels.arrays import BoolArray, FloatArray
+from kreps.kernels.kernel import Factor, factors_of
+
+LONGEST_SIDE = 1024
+"""Of an image, in pixels: smoothing costs its square in memory, its cube in time."""
+
+LARGEST = 1e100
+"""Numbers beyond this are no data: their squares would overflow."""
+
+
+def is_sane(values: FloatArray) -> BoolArray:
+    """Which ``values`` are neither NaN nor infinite nor absurdly large."""
+    return np.abs(values) <= LARGEST
+
+
+@dataclass(frozen=True, eq=False)
+class TaskSpec:
+    """What the learner must know of a task; everything else it learns.
+
+    Attributes:
+        observation_size: number of coordinates of an observation.
+        action_low, action_high: (da,) finite limits of the actions, in the task's units.
+        periodic: the observation coordinates that are angles in rad (period 2 pi).
+        groups: observation coordinates that share a lengthscale, such as the pixels of an image;
+            a coordinate in no group has its own.
+        image_shape: (height, width) if the groups are images, each row by row from the top; then
+            every coordinate belongs to one.
+    """
+
+    observation_size: int
+    action_low: FloatArray
+    action_high: FloatArray
+    periodic: tuple[int, ...] = ()
+    groups: tuple[tuple[int, ...], ...] = ()
+    image_shape: tuple[int, int] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "action_low", np.array(self.action_low, np.float64, ndmin=1))
+        object.__setattr__(self, "action_high", np.array(self.action_high, np.float64, ndmin=1))
+        try:
+            periodic = tuple(sorted({operator.index(i) for i in self.periodic}))
+            object.__setattr__(self, "periodic", periodic)
+            object.__setattr__(self, "observation_size", operator.index(self.observation_size))
+            groups = tuple(tuple(sorted({operator.index(i) for i in g})) for g in self.groups)
+            object.__setattr__(self, "groups", tuple(g for g in groups if g))
+        except TypeError as error:
+            raise ConfigurationError(
+                f"observation_size = {self.observation_size!r} and periodic = {self.periodic!r}, "
+                "but a whole number and a list of whole numbers are needed, as 3 and (0, 2)"
+            ) from error
+        if self.observation_size < 1:
+            raise ConfigurationError(
+                f"observation_size = {self.observation_size}, but at least one coordinate is needed"
+            )
+        low, high = self.action_low, self.action_high
+        if low.ndim != 1 or low.shape != high.shape or low.size == 0:
+            raise ConfigurationError(
+                f"action limits have shapes {low.shape} and {high.shape}; "
+                "give two vectors of the same positive length"
+            )
+        if not (is_sane(low).all() and is_sane(high).all() and (low < high).all()):
+            raise ConfigurationError(
+                f"action limits {low} to {high} must be finite and low < high; "
+                "the policy needs a scale for its actions, so give a bounded range"
+            )
+        grouped = [i for group in self.groups for i in group]
+        if len(set(grouped)) < len(grouped):
+            raise ConfigurationError("a coordinate is in two groups; it has one lengthscale")
+        angles = set(self.periodic)
+        mixed = [g for g in self.groups if 0 < len(angles.intersection(g)) < len(g)]
+        if mixed:
+            raise ConfigurationError(
+                f"the group {mixed[0]!s:.60} mixes angles and other coordinates, which share "
+                "no scale"
+            )
+        if self.image_shape is not None:
+            try:
+                height, width = (operator.index(size) for size in self.image_shape)
+            except (TypeError, ValueError):
+                height, width = 0, 0
+            if not (1 <= height <= LONGEST_SIDE and 1 <= width <= LONGEST_SIDE):
+                raise ConfigurationError(
+                    f"image_shape = {self.image_shape!r:.60}, but (height, width) is needed, two "
+                    f"whole numbers from 1 to {LONGEST_SIDE}"
+                )
+            object.__setattr__(self, "image_shape", (height, width))
+            if {len(group) for group in self.groups} != {height * width} or (
+                len(grouped) != self.observation_size
+            ):
+                raise ConfigurationError(
+                    f"image_shape = {self.image_shape}, but the groups have "
+                    f"{[len(group) for group in self.groups]!s:.60} of {self.observation_size} "
+                    f"coordinates; each must be an image of {height} x {width}, and all in one"
+                )
+        named = (*self.periodic, *grouped)
+        outside = [i for i in named if not 0 <= i < self.observation_size]
+        if outside:
+            raise ConfigurationError(
+                f"periodic or grouped coordinates {outside!s:.60} do not exist: observations have "
+                f"{self.observation_size} coordinates, numbered from 0"
+            )
+
+    @property
+    def state_factors(self) -> tuple[Factor, ...]:
+        """The factors of a kernel over observations, each with one lengthscale."""
+        return factors_of(self.observation_size, self.periodic, self.groups, self.image_shape)
+
+    @property
+    def factor_count(self) -> int:
+        """How many lengthscales that are, counted without making them (a file may lie)."""
+        return self.observation_size - sum(len(group) - 1 for group in self.groups)
+
+    @property
+    def action_size(self) -> int:
+        return len(self.action_low)
+
+    @property
+    def action_centre(self) -> FloatArray:
+        return 0.5 * (self.action_low + self.action_high)
+
+    @property
+    def action_scale(self) -> FloatArray:
+        """Half the range (da,): actions in these units lie in [-1, 1] around the centre."""
+        return 0.5 * (self.action_high - self.action_low)
+
+    def scaled(self, actions: FloatArray) -> FloatArray:
+        """Actions (m, da) around their centre, in units of the action scale."""
+        return (actions - self.action_centre) / self.action_scale
+
+    def unscaled(self, actions: FloatArray) -> FloatArray:
+        """Scaled actions (m, da) in the task's units."""
+        return self.action_centre + self.action_scale * actions
+
+    def clip(self, actions: FloatArray) -> FloatArray:
+        """The *applied* actions: what the actuators make of the commanded ones."""
+        return np.clip(actions, self.action_low, self.action_high)

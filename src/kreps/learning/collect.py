@@ -1,0 +1,263 @@
+"""Collects roll-outs: in batches where the task offers them, step by step from any environment.
+
+Both ways address their randomness by roll-out, and lengths that are drawn together by batch, so
+they give the same data from the same seed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+
+from kreps.data.rollout import Rollout
+from kreps.data.task import LARGEST, TaskSpec, is_sane
+from kreps.envs.batch import BatchModel, SettableModel
+from kreps.envs.restart import restart_length, stratified_lengths
+from kreps.errors import ConfigurationError, DataError, EnvironmentFailure
+from kreps.kernels.arrays import FloatArray, grid_points
+from kreps.learning.environment import (
+    Environment,
+    _limits,
+    batch_model_of,
+    time_limit,
+)
+from kreps.policies.base import StochasticPolicy
+from kreps.policies.exploration import WHITE, coloured_noise
+from kreps.seeding import Purpose, generator, integer_seed
+
+
+def collect(
+    env: Environment,
+    task: TaskSpec,
+    policy: StochasticPolicy,
+    count: int,
+    *,
+    seed: int,
+    iteration: int,
+    restart_probability: float,
+    stratified: bool = False,
+    exponent: float = WHITE,
+    on_rollout: Callable[[int], None] | None = None,
+) -> list[Rollout]:
+    """``count`` roll-outs of random length.
+
+    Args:
+        stratified: whether their lengths are drawn together (`stratified_lengths`), so that they
+            depend on how many there are; else each is that of `RandomRestart` with its seed.
+        exponent: of the spectrum of the policy's noise (`kreps.exploration.coloured_noise`).
+        on_rollout: called with the number of roll-outs that are complete.
+
+    Raises:
+        EnvironmentFailure: the environment raised.
+        DataError: it returned NaN, infinities or observations of another size.
+    """
+    seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
+    rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
+    limit = time_limit(env)
+    if stratified:
+        together = generator(seed, Purpose.RESTART, iteration)
+        drawn = stratified_lengths(together, restart_probability, count)
+    else:
+        drawn = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
+    lengths = [min(length, limit) for length in drawn]
+    noises = [
+        coloured_noise(exponent, length, task.action_size, rng)
+        for length, rng in zip(lengths, rngs, strict=True)
+    ]
+    return simulate(env, task, policy, seeds, noises, on_rollout)
+
+
+def collect_grid(
+    env: Environment,
+    task: TaskSpec,
+    ranges: Sequence[tuple[float, float]] | None,
+    grid_states: int,
+    grid_actions: int,
+    *,
+    most: int,
+    seed: int,
+    iteration: int,
+) -> list[Rollout]:
+    """One step from every point of a grid over states and actions: roll-outs of one step.
+
+    Args:
+        env: its batch model is a `kreps.envs.batch.SettableModel`.
+        ranges: least and largest value of each coordinate; None asks the observation space.
+        grid_states, grid_actions: points per coordinate.  Angles are spaced over a whole turn.
+        most: grid points that may be asked for.
+
+    Raises:
+        ConfigurationError: the environment cannot be set to a state, or there are too many points.
+        SpaceError: a coordinate has no limits.
+    """
+    model = batch_model_of(env)
+    if model is None or not hasattr(model, "states_at"):
+        raise ConfigurationError(
+            f"{env} cannot be set to any state, which a grid of states needs: its batch_model "
+            "would have states_at(observations); use kreps.ValueIteration, which explores by itself"
+        )
+    count = grid_states**task.observation_size * grid_actions**task.action_size
+    if count > most:
+        raise ConfigurationError(
+            f"a grid of {grid_states} points in each of {task.observation_size} state and "
+            f"{grid_actions} in each of {task.action_size} action coordinates has "
+            f"{count if count < 10**9 else 'more than 10^9'} points, the limit is {most} (the "
+            "window, and what an exact update can take); lower grid_states or grid_actions"
+        )
+    axes = [
+        np.arange(grid_states) * 2.0 * np.pi / grid_states
+        if i in task.periodic
+        else np.linspace(*limits, grid_states)
+        for i, limits in enumerate(_limits(env, task, ranges))
+    ]
+    axes += [
+        np.linspace(low, high, grid_actions)
+        for low, high in zip(task.action_low, task.action_high, strict=True)
+    ]
+    states, actions = np.split(grid_points(axes), [task.observation_size], axis=1)
+    rngs = [generator(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
+    try:
+        simulated = cast(SettableModel, model).states_at(states)
+        observations = _checked(model.observe(simulated), count, task).copy()
+        simulated, rewards, ended = model.step(simulated, actions, rngs)
+        successors = _checked(model.observe(simulated), count, task)
+    except DataError:
+        raise
+    except Exception as error:
+        raise _failure(error, "a grid of states", 0) from error
+    return [
+        Rollout(np.stack([before, after]), action[None], np.array([reward]), bool(end))
+        for before, after, action, reward, end in zip(
+            observations, successors, actions, rewards, ended, strict=True
+        )
+    ]
+
+
+def simulate(
+    env: Environment,
+    task: TaskSpec,
+    policy: StochasticPolicy,
+    seeds: Sequence[int],
+    noises: Sequence[FloatArray],
+    on_rollout: Callable[[int], None] | None = None,
+) -> list[Rollout]:
+    """One roll-out per seed, with the policy's noise as given, (length, da) each, and as long."""
+    model = batch_model_of(env)
+    if model is not None:
+        rollouts = _simulate_batch(model, task, policy, seeds, noises)
+        if on_rollout is not None:
+            on_rollout(len(rollouts))
+        return rollouts
+    rollouts = []
+    for number, (seed, noise) in enumerate(zip(seeds, noises, strict=True)):
+        rollouts.append(_simulate_one(env, task, policy, seed, noise, number))
+        if on_rollout is not None:
+            on_rollout(number + 1)
+    return rollouts
+
+
+def _simulate_batch(
+    model: BatchModel,
+    task: TaskSpec,
+    policy: StochasticPolicy,
+    seeds: Sequence[int],
+    noises: Sequence[FloatArray],
+) -> list[Rollout]:
+    rngs = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
+    ends = np.array([len(noise) for noise in noises])  # shortened where a roll-out really ends
+    terminated = np.zeros(len(ends), dtype=bool)
+    longest = int(ends.max())
+    observations = np.empty((longest + 1, len(ends), task.observation_size))
+    actions = np.empty((longest, len(ends), task.action_size))
+    rewards = np.empty((longest, len(ends)))
+    t = 0
+    try:
+        states = model.initial(rngs)
+        observations[0] = _checked(model.observe(states), len(ends), task)
+        for t in range(longest):
+            live = np.flatnonzero(ends > t)
+            if len(live) == 0:
+                break
+            noise = np.stack([noises[int(j)][t] for j in live])
+            actions[t, live] = policy.act(observations[t, live], noise)
+            states[live], rewards[t, live], done = model.step(
+                states[live], task.clip(actions[t, live]), [rngs[int(j)] for j in live]
+            )
+            observations[t + 1, live] = _checked(model.observe(states[live]), len(live), task)
+            ends[live[done]] = t + 1
+            terminated[live[done]] = True
+    except DataError:
+        raise
+    except Exception as error:
+        raise _failure(error, "its batch of roll-outs", t) from error
+    return [
+        Rollout(observations[: end + 1, j], actions[:end, j], rewards[:end, j], bool(terminated[j]))
+        for j, end in enumerate(ends.tolist())
+    ]
+
+
+def _simulate_one(
+    env: Environment,
+    task: TaskSpec,
+    policy: StochasticPolicy,
+    seed: int,
+    noise: FloatArray,
+    number: int,
+) -> Rollout:
+    space = env.action_space
+    observations: list[FloatArray] = []
+    actions: list[FloatArray] = []
+    rewards: list[float] = []
+    terminated = truncated = False
+    try:
+        observation, _ = env.reset(seed=seed)
+        observations.append(_state(observation, task))
+        while not (terminated or truncated) and len(rewards) < len(noise):
+            state = observations[-1]
+            action = policy.act(state[None], noise[len(actions)][None])[0]
+            applied = task.clip(action).astype(space.dtype).reshape(space.shape or ())
+            observation, reward, terminated, truncated, _ = env.step(applied)
+            observations.append(_state(observation, task))
+            actions.append(action)
+            rewards.append(float(reward))
+    except DataError as error:
+        where = f"roll-out {number} of the environment, after {len(actions)} steps"
+        raise DataError(f"{where}: {error}") from error
+    except Exception as error:
+        raise _failure(error, f"roll-out {number}", len(rewards)) from error
+    try:
+        return Rollout(np.stack(observations), np.stack(actions), np.array(rewards), terminated)
+    except DataError as error:
+        raise DataError(f"roll-out {number} of the environment: {error}") from error
+
+
+def _failure(error: Exception, where: str, steps: int) -> EnvironmentFailure:
+    return EnvironmentFailure(
+        f"the environment raised {type(error).__name__} in {where}, after {steps} steps: {error}; "
+        "what was learnt before is kept, so mend the environment and call learn() again"
+    )
+
+
+def _checked(observations: FloatArray, count: int, task: TaskSpec) -> FloatArray:
+    if np.shape(observations) != (count, task.observation_size):
+        raise DataError(
+            f"the batch model returned observations of shape {np.shape(observations)}, but "
+            f"({count}, {task.observation_size}) is needed"
+        )
+    return observations
+
+
+def _state(observation: Any, task: TaskSpec) -> FloatArray:
+    """An observation as a vector the policy can be asked about."""
+    state = np.array(observation, dtype=np.float64).ravel()
+    if len(state) != task.observation_size:
+        raise DataError(
+            f"an observation has {len(state)} coordinates, but the space promises "
+            f"{task.observation_size}"
+        )
+    if not is_sane(state).all():
+        raise DataError(f"an observation holds NaN, an infinity or a number beyond {LARGEST:g}")
+    return state

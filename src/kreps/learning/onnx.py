@@ -1,0 +1,250 @@
+"""Policies as ONNX models: mean and standard deviation where there is no Python.
+
+A model computes what `SparseGP` computes.  Kernel values come from differences of coordinates, not
+from inner products as in `kernels.gaussian_gram`: those cost less in large batches, but lose up to
+``|e|^2`` roundings in the exponent.  Single precision has none to spare: weights are large, of
+alternating sign, and multiply each error of a kernel value.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from kreps.errors import ConfigurationError
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import Factor, Periodic, SmoothedImage, SquaredExponential, smoothing
+from kreps.learning.storage import write_atomically
+from kreps.policies.sparse_gp import SparseGP
+
+OPSET, IR_VERSION = 17, 8
+"""Of 2022, so that runtimes on robots need not be new."""
+
+Number = type[np.floating[Any]]
+DTYPES: dict[str, Number] = {"float64": np.float64, "float32": np.float32}
+
+SINGLE_PRECISION_TOLERANCE = 1e-4
+"""Largest error of the mean, in units of the action scale, that is left to single precision."""
+
+
+def write_onnx(policy: SparseGP, path: Path, dtype: str = "float64") -> str:
+    """Write a model of ``policy`` with opset 17 of ONNX; the same policy gives the same bytes.
+
+    Input ``observation`` (batch, ds).  Outputs ``action`` (batch, da), the mean clipped to the
+    task's limits, and ``standard_deviation`` (batch, da) of the commanded action, both in the
+    task's units.  A batch needs memory for batch x centres x coordinates numbers.  A model cannot
+    refuse an observation: NaN comes out as NaN.
+
+    Args:
+        policy: r centres.
+        path: the file to replace.
+        dtype: "float64" or "float32", of input and outputs.  What lies between them is of the
+            same type, unless `single_precision_error` is beyond `SINGLE_PRECISION_TOLERANCE`:
+            then it is float64.
+
+    Returns:
+        The type of what lies between.
+
+    Raises:
+        ConfigurationError: ONNX is not installed, or another dtype, or numbers of the policy are
+            too large for it.
+        StorageError: the file cannot be written.
+    """
+    if dtype not in tuple(DTYPES):  # it may be of any type
+        raise ConfigurationError(
+            f"dtype = {dtype!r:.40}, but a model is computed in one of {', '.join(DTYPES)}"
+        )
+    try:
+        import onnx
+    except ImportError as error:
+        raise ConfigurationError(
+            f"writing {path} needs ONNX, which is not installed: pip install 'kreps[onnx]'"
+        ) from error
+    single = single_precision_error(policy) <= SINGLE_PRECISION_TOLERANCE
+    arithmetic = dtype if single else "float64"
+    with np.errstate(over="ignore"):  # refused by name in `constant`
+        graph = _graph_of(policy, onnx.helper, DTYPES[dtype], DTYPES[arithmetic])
+    model = onnx.helper.make_model(
+        graph,
+        opset_imports=[onnx.helper.make_opsetid("", OPSET)],
+        ir_version=IR_VERSION,
+        producer_name="kreps",
+        producer_version=version("kreps"),
+        doc_string=(
+            "A Gaussian process policy. action: its mean, clipped to the limits of the task; "
+            "standard_deviation: of the commanded action; both in the units of the task."
+        ),
+    )
+    onnx.helper.set_model_props(model, {"kreps": _note(policy, arithmetic)})
+    write_atomically(path, model.SerializeToString(deterministic=True))
+    return arithmetic
+
+
+def single_precision_error(policy: SparseGP) -> float:
+    """What single precision does to the mean, estimated from above, in units of the action scale.
+
+    A kernel value ``k_j`` is off by a few parts in 2^24, so the mean by that much of
+    ``sum_j k_j |w_j|``, which is largest near the centres.  Measured errors were less
+    than half of this.
+    """
+    k = policy.kernel.gram(policy.states)
+    magnitude = float((k @ np.abs(policy.mean_weights)).max(initial=0.0))
+    return 2.0 * float(np.finfo(np.float32).eps) * magnitude
+
+
+def _note(policy: SparseGP, arithmetic: str) -> str:
+    """What a model is, for who finds it later."""
+    task = policy.task
+    content = {
+        "version": version("kreps"),
+        "policy": "sparse-gp",
+        "centres": len(policy.states),
+        "arithmetic": arithmetic,
+        "action_low": task.action_low.tolist(),
+        "action_high": task.action_high.tolist(),
+        "periodic": list(task.periodic),
+        "image_shape": None if task.image_shape is None else list(task.image_shape),
+    }
+    return json.dumps(content, sort_keys=True)
+
+
+class _Graph:
+    """Nodes and constants in the order in which they are asked for.
+
+    Attributes:
+        dtype: of the arithmetic.
+    """
+
+    def __init__(self, helper: Any, dtype: Number) -> None:
+        self.helper, self.dtype = helper, dtype
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
+
+    def constant(self, name: str, values: Any, dtype: Number | None = None) -> str:
+        """A tensor, of the dtype of the arithmetic unless another one is given."""
+        dtype = dtype or self.dtype
+        array = np.asarray(values, dtype=np.float64).astype(dtype)
+        if not np.isfinite(array).all():
+            raise ConfigurationError(
+                f"{name} of the policy go up to {np.abs(values).max():.3g}, the limit of "
+                f"{np.dtype(dtype).name} is {np.finfo(dtype).max:.3g}; "
+                "export it in float64, or learn in other units"
+            )
+        return self._tensor(name, array)
+
+    def integers(self, name: str, values: Sequence[int]) -> str:
+        return self._tensor(name, np.array(values, dtype=np.int64))
+
+    def _tensor(self, name: str, array: NDArray[Any]) -> str:
+        data = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes()
+        kind = self.kind(array.dtype)
+        self.constants.append(self.helper.make_tensor(name, kind, array.shape, data, raw=True))
+        return name
+
+    def kind(self, dtype: Any) -> int:
+        """The number that ONNX gives to a dtype."""
+        return int(self.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
+
+    def node(self, operation: str, *inputs: str, out: str = "", **attributes: Any) -> str:
+        """The name of the node's output, ``out`` or one made up."""
+        name = out or f"{operation.lower()}_{len(self.nodes)}"
+        self.nodes.append(self.helper.make_node(operation, inputs, [name], name=name, **attributes))
+        return name
+
+    def cast(self, values: str, dtype: Number, out: str = "") -> str:
+        return self.node("Cast", values, out=out, to=self.kind(dtype))
+
+
+def _graph_of(policy: SparseGP, helper: Any, border: Number, arithmetic: Number) -> Any:
+    """From inputs of dtype ``border`` by ``arithmetic`` to outputs of dtype ``border``."""
+    graph, task = _Graph(helper, arithmetic), policy.task
+    k = _kernel_values(graph, policy, graph.cast("observation", arithmetic))
+
+    weights = graph.constant("mean_weights", policy.mean_weights * task.action_scale)
+    centre = graph.constant("action_centre", task.action_centre)
+    mean = graph.cast(graph.node("Add", graph.node("MatMul", k, weights), centre), border)
+    low, high = (
+        graph.constant(name, _inwards(limit, task.action_centre, border), border)
+        for name, limit in (("action_low", task.action_low), ("action_high", task.action_high))
+    )
+    graph.node("Min", graph.node("Max", mean, low), high, out="action")
+
+    part = graph.node("MatMul", k, graph.constant("explained", policy.explained.T))
+    squares = graph.node("Mul", part, part)
+    explained = graph.node("ReduceSum", squares, graph.integers("centre_axis", [1]), keepdims=1)
+    left = graph.node("Sub", graph.constant("signal", policy.signal), explained)
+    left = graph.node("Max", left, graph.constant("zero", 0.0))
+    deviation = graph.node("Sqrt", graph.node("Add", left, graph.constant("noise", policy.noise)))
+    deviation = graph.node("Mul", deviation, graph.constant("action_scale", task.action_scale))
+    graph.cast(deviation, border, out="standard_deviation")
+
+    widths = {
+        "observation": task.observation_size,
+        "action": task.action_size,
+        "standard_deviation": task.action_size,
+    }
+    borders = [
+        helper.make_tensor_value_info(name, graph.kind(border), ["batch", width])
+        for name, width in widths.items()
+    ]
+    return helper.make_graph(
+        graph.nodes, "kreps_policy", borders[:1], borders[1:], initializer=graph.constants
+    )
+
+
+def _kernel_values(graph: _Graph, policy: SparseGP, observation: str) -> str:
+    """``k(observation, centres)``, (batch, r)."""
+    kernel, states = policy.kernel, policy.states
+    parts = [factor.coordinates(states) for factor in kernel.factors]
+    raw = np.concatenate(parts, axis=1)
+    # The same rounded origin on both sides.  It is taken off before lengthscales are divided by:
+    # what is near the centres then keeps all its digits, wherever they lie.
+    origin = raw.mean(axis=0).astype(graph.dtype)
+    per_length = 1.0 / np.repeat(kernel.lengthscales, [part.shape[1] for part in parts])
+    found = [
+        _coordinates(graph, factor, observation, f"factor_{i}")
+        for i, factor in enumerate(kernel.factors)
+    ]
+    coordinates = graph.node("Concat", *found, axis=1)
+    coordinates = graph.node("Sub", coordinates, graph.constant("origin", origin))
+    coordinates = graph.node("Mul", coordinates, graph.constant("per_lengthscale", per_length))
+    each = graph.node("Unsqueeze", coordinates, graph.integers("centres_axis", [1]))
+    centres = graph.constant("centres", (raw - origin) * per_length)
+    difference = graph.node("Sub", each, centres)
+    squares = graph.node("Mul", difference, difference)
+    axis = graph.integers("coordinates_axis", [2])
+    squared = graph.node("ReduceSum", squares, axis, keepdims=0)
+    return graph.node("Exp", graph.node("Mul", squared, graph.constant("minus_half", -0.5)))
+
+
+def _coordinates(graph: _Graph, factor: Factor, observation: str, name: str) -> str:
+    """``factor.coordinates(observation)``, (batch, m); ``name`` is that of its constants."""
+    assert isinstance(factor, SquaredExponential | Periodic | SmoothedImage)
+    dims = graph.integers(f"{name}_dims", factor.dims)
+    columns = graph.node("Gather", observation, dims, axis=1)
+    if isinstance(factor, SquaredExponential):
+        return columns
+    if isinstance(factor, Periodic):
+        parts = [graph.node(operation, columns) for operation in ("Cos", "Sin")]
+        return graph.node("Concat", *parts, axis=1)
+    down, across = (smoothing(size) for size in factor.shape)
+    shape = graph.integers(f"{name}_shape", [0, *factor.shape])  # 0: as many as came in
+    image = graph.node("Reshape", columns, shape)
+    image = graph.node("MatMul", graph.constant(f"{name}_down", down), image)
+    image = graph.node("MatMul", image, graph.constant(f"{name}_across", across.T))
+    return graph.node(
+        "Reshape", image, graph.integers(f"{name}_flat", [0, len(down) * len(across)])
+    )
+
+
+def _inwards(limit: FloatArray, centre: FloatArray, dtype: Number) -> NDArray[Any]:
+    """``limit`` in ``dtype``, never farther from ``centre``: no action may lie beyond it."""
+    rounded = limit.astype(dtype)
+    beyond = np.abs(rounded.astype(np.float64) - centre) > np.abs(limit - centre)
+    return np.where(beyond, np.nextafter(rounded, centre.astype(dtype)), rounded)

@@ -1,0 +1,172 @@
+"""The policy as its user holds it: predict, save, load, compress, export."""
+
+from __future__ import annotations
+
+import operator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kreps.data.task import LARGEST, is_sane
+from kreps.errors import ConfigurationError, DataError
+from kreps.kernels.arrays import FloatArray
+from kreps.learning import storage
+from kreps.learning.onnx import write_onnx
+from kreps.policies.base import LearntPolicy
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
+from kreps.policies.sparse_gp import SparseGP
+from kreps.seeding import Purpose, generator
+
+
+class Policy:
+    """A learnt stochastic policy, with Stable-Baselines3's signature of `predict`.
+
+    Args:
+        process: what it draws from, for REPS a cost-sensitive Gaussian process.
+        seed: of the exploration noise in `predict`.
+    """
+
+    def __init__(self, process: LearntPolicy, seed: int = 0) -> None:
+        self.process = process
+        self.seed = seed
+        self._noise = generator(seed, Purpose.PREDICT)
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = False,
+    ) -> tuple[FloatArray, Any]:
+        """Actions for one observation or a batch of them, clipped to the task's limits.
+
+        Args:
+            observation: (ds,) or (m, ds).
+            state, episode_start: accepted for compatibility; this policy has no memory.
+            deterministic: the policy without its exploration (the mean of a Gaussian process).
+
+        Returns:
+            Action (da,) or actions (m, da) in the task's units, and ``state`` as it came.
+
+        Raises:
+            DataError: another shape, NaN or infinities.
+        """
+        task = self.process.task
+        try:
+            batch = np.asarray(observation, dtype=np.float64)
+        except (TypeError, ValueError) as error:
+            raise DataError(f"the observation is not an array of numbers: {error}") from error
+        if batch.ndim not in (1, 2) or batch.shape[-1] != task.observation_size:
+            raise DataError(
+                f"the observation has shape {batch.shape}, but ({task.observation_size},) or "
+                f"(m, {task.observation_size}) is needed; flatten images first"
+            )
+        if not is_sane(batch).all():
+            raise DataError(
+                f"the observation holds NaN, an infinity or a number beyond {LARGEST:g}: "
+                "no action is safe there"
+            )
+        states = np.atleast_2d(batch)
+        if deterministic:
+            commanded = self.process.greedy(states)
+        else:
+            noise = self._noise.standard_normal((len(states), task.action_size))
+            commanded = self.process.act(states, noise)
+        actions = task.clip(commanded)
+        return (actions[0] if batch.ndim == 1 else actions), state
+
+    def save(self, path: str | Path) -> None:
+        """Write the policy as arrays and JSON; read it back with `kreps.load_policy`."""
+        storage.save_policy(self.process, path)
+
+    def compressed(self, centres: int) -> Policy:
+        """This policy on at most ``centres`` support points: a smaller model, a faster cycle.
+
+        All samples still count, and far from the centres the exploration is that of the prior.
+        How much performance it costs is worth an evaluation: see ``benchmarks/predict.py``.
+
+        Returns:
+            A policy with this one's seed, or this policy if it has no more centres.
+
+        Raises:
+            ConfigurationError: fewer than one centre, or a policy that has no samples to compress.
+        """
+        try:
+            count = operator.index(centres)
+        except TypeError as error:
+            raise ConfigurationError(
+                f"centres = {centres!r:.40}, but a whole number is needed, such as 50"
+            ) from error
+        if count < 1:
+            raise ConfigurationError(
+                f"centres = {count}, but a policy needs at least one; 50 are often enough"
+            )
+        process = self.process
+        if isinstance(process, CostSensitiveGP):
+            return Policy(process.compressed(count), self.seed)
+        if not isinstance(process, SparseGP):
+            raise ConfigurationError(_no_process(process, "compress"))
+        if len(process.states) > count:
+            raise ConfigurationError(
+                f"the policy has {len(process.states)} centres and no samples any more, {count} "
+                f"were asked for; compress the exact policy, or learn with rank = {count}"
+            )
+        return self
+
+    def export_onnx(self, path: str | Path, dtype: str = "float64") -> str:
+        """Write an ONNX model of the policy, for controllers without Python.
+
+        Its input is ``observation`` (batch, ds), its outputs are ``action`` (batch, da), the mean
+        clipped to the task's limits, and ``standard_deviation`` (batch, da) of the commanded
+        action, both in the task's units.
+        A model is for following the policy without its exploration.
+
+        Args:
+            path: such as ``policy.onnx``; the folder must exist.
+            dtype: "float64" or "float32", of input and outputs.  All arithmetic is of the same
+                type, unless float32 could put the mean off by 1e-4 of the action scale: then it
+                is float64 all the same.  Compressed policies are well within that.
+
+        Returns:
+            The type of the arithmetic.
+
+        Raises:
+            ConfigurationError: ONNX is not installed (``pip install 'kreps[onnx]'``), or the
+                policy is no Gaussian process.
+            StorageError: the file cannot be written.
+        """
+        process = self.process
+        if isinstance(process, CostSensitiveGP):
+            process = process.predictor
+        if not isinstance(process, SparseGP):
+            raise ConfigurationError(_no_process(process, "export"))
+        return write_onnx(process, Path(path), dtype)
+
+
+def _no_process(process: LearntPolicy, verb: str) -> str:
+    return (
+        f"there is no Gaussian process to {verb} in a policy of type {type(process).__name__}; "
+        "learn one with kreps.KREPS, or save this policy as it is"
+    )
+
+
+def mean_difference(exact: Policy, compressed: Policy) -> float:
+    """Root mean square of what compression does to actions without exploration.
+
+    At the support points of the exact policy, in units of the action scale, after clipping: small
+    where the policy is as good as before, which `kreps.evaluation` can confirm.
+    """
+    process = exact.process
+    assert isinstance(process, CostSensitiveGP | SparseGP)
+    a, b = (p.predict(process.states, deterministic=True)[0] for p in (exact, compressed))
+    return float(np.sqrt(np.mean(((a - b) / process.task.action_scale) ** 2)))
+
+
+def load_policy(path: str | Path, seed: int = 0) -> Policy:
+    """A policy saved by `Policy.save`; ``seed`` is that of its exploration noise.
+
+    Raises:
+        StorageError: the file is missing, damaged or foreign.
+    """
+    return Policy(storage.load_policy(path), seed)

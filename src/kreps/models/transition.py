@@ -1,0 +1,184 @@
+"""The conditional embedding fitted to a window of transitions, as several methods need it.
+
+And what every step of REPS makes of it: the differences of features, restarts included.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from kreps.data.rollout import Transitions
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.hyperparameters import EmbeddingLoss, Prior, factor_distances, minimise
+from kreps.kernels.kernel import Kernel, SquaredExponential, cut_factors, median_lengthscales
+from kreps.kernels.regression import KernelEmbedding, PivotedEmbedding
+from kreps.kernels.sampling import evidence, telling_rows
+from kreps.settings import Settings
+
+CUT_LENGTHSCALE = np.pi
+"""Of the numbers of angles in V's kernel, rad: a turn apart, states are ``exp(-2)`` alike, so that
+V can jump there, and little is lost where it need not."""
+
+UNCUT_LENGTHSCALE = 1e6
+"""The same, rad, where angles count their turns: all of one turn are alike."""
+
+
+def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) -> Kernel:
+    """The kernel over states at the median lengthscales."""
+    factors = task.state_factors
+    return Kernel(factors, median_lengthscales(factors, data.points, rng))
+
+
+def with_cuts(kernel: Kernel, data: Transitions, task: TaskSpec, settings: Settings) -> Kernel:
+    """The kernel over states of what may jump where the numbers of an angle begin anew.
+
+    A reward often comes from the number, as ``-theta^2`` does, and jumps from one end of a turn to
+    the other; so does V, which has it in it.  What moves does not, nor does a good action.
+
+    Args:
+        kernel: over states, at V's lengthscales.
+        data: tells where the cut is: within the gap that its angles leave of a turn.  An angle that
+            counts its turns has none.
+        task: which coordinates are angles.
+        settings: ``angles``; nothing is changed where they are round.
+    """
+    if settings.angles == "round" or settings.features == "grid":
+        return kernel
+    angles = data.points[:, list(task.periodic)]
+    low, high = angles.min(axis=0), angles.max(axis=0)
+    begins = 0.5 * (low + high) - np.pi
+    lengthscales = np.where(high - low <= 2.0 * np.pi, CUT_LENGTHSCALE, UNCUT_LENGTHSCALE)
+    cuts = cut_factors(task.periodic, begins)
+    return Kernel((*kernel.factors, *cuts), np.append(kernel.lengthscales, lengthscales))
+
+
+def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
+    """Observed ``phi(s'_i)``, (n, r) or (n,); after a real end the start states are the successor.
+
+    Args:
+        data: n transitions.
+        features: (m, r) or (m,) of all points.
+    """
+    successors = features[data.successor]
+    successors[data.terminated] = features[data.start].mean(axis=0)
+    return successors
+
+
+def restart_features(starts: FloatArray, states: FloatArray, settings: Settings) -> FloatArray:
+    """Mean features (r,) of the states that the process restarts in, as the update sees it.
+
+    A restart with probability p is a discount 1 - p, and under a discount there is a policy that
+    is best from every state at once: other restarts leave it optimal.  But the dual hardly settles
+    V where its weights are not, and noise leads there; exploring starts spread the weights.
+
+    Args:
+        starts, states: (r,) means over the start states and over the sampled states (in low rank:
+            over those of the sample).
+        settings: ``exploring_starts``, the share of the latter.
+    """
+    share = settings.exploring_starts
+    return (1.0 - share) * starts + share * states
+
+
+def feature_differences(
+    own: FloatArray, expected: FloatArray, restart: FloatArray, restart_probability: float
+) -> FloatArray:
+    """``B = (1 - p) E[phi(s') | s_i, a_i] + p phi_restart - phi(s_i)``, (n, r).
+
+    The process restarts with the known probability p, so that part of the dynamics needs no model.
+
+    Args:
+        own, expected: (n, r) features of each state, and what they are expected to become.
+        restart: (r,) of `restart_features`.
+        restart_probability: p.
+    """
+    return (1.0 - restart_probability) * expected + restart_probability * restart - own
+
+
+def state_actions(data: Transitions, task: TaskSpec) -> FloatArray:
+    """States and applied actions side by side, (n, ds + da), actions in units of their scale."""
+    return np.concatenate([data.states, task.scaled(task.clip(data.actions))], axis=1)
+
+
+def embedding_hyperparameters(
+    inputs: FloatArray,
+    targets: FloatArray,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+) -> tuple[Kernel, float, FloatArray]:
+    """Kernel and regulariser of the embedding by leave-one-out error (Eq. 4), and their logs.
+
+    And of any other regression on states and applied actions: it is the same.
+
+    Args:
+        inputs: (n, ds + da) states and applied actions.
+        targets: (n, r) what is to be predicted, such as features of the observed successors.
+        state_kernel: its factors are those of the embedding's kernel, with other lengthscales, of
+            which these are the typical ones.
+        task: number of action coordinates.
+        start: log hyper-parameters (g + da + 1,) where the last fit ended, if there was one.
+        rng: chooses the samples of the fit.
+    """
+    action_factors = tuple(
+        SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
+    )
+    factors = (*state_kernel.factors, *action_factors)
+    squares = np.sum((targets - targets.mean(axis=0)) ** 2, axis=1)
+    sample, weights = telling_rows(squares, rng)
+    of_actions = median_lengthscales(action_factors, inputs, rng)
+    typical = np.log(np.append(state_kernel.lengthscales, of_actions))
+    prior = Prior(
+        centre=np.append(typical, np.log(1e-3)),
+        spread=np.append(np.ones(len(factors)), 3.0),
+        low=np.append(typical - 3.0, np.log(1e-6)),
+        high=np.append(typical + 3.0, 0.0),
+        # the loss is twice minus the log density of one Gaussian error whose variance is fitted
+        strength=2.0 / evidence(squares[sample], weights),
+    )
+    loss = EmbeddingLoss(
+        factor_distances(factors, inputs[sample]), targets[sample], weights / weights.mean()
+    )
+    noisy = np.append(typical, np.log(0.1))
+    starts = (prior.centre, noisy) if start is None else (start, prior.centre, noisy)
+    x = minimise(loss, prior, *starts)
+    return Kernel(factors, np.exp(x[:-1])), float(np.exp(x[-1])), x
+
+
+def fit_embedding(
+    data: Transitions,
+    targets: FloatArray,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+) -> tuple[KernelEmbedding, FloatArray]:
+    """The embedding (Eq. 4) of n transitions on states and applied actions, and its log parameters.
+
+    Arguments are those of `embedding_hyperparameters`, with (n, r) ``targets``: features of
+    successors, or anything else that is to be regressed.
+    """
+    inputs = state_actions(data, task)
+    kernel, regulariser, x = embedding_hyperparameters(
+        inputs, targets, state_kernel, task, start, rng
+    )
+    return KernelEmbedding.fit(kernel, inputs, regulariser), x
+
+
+def fit_regression(
+    data: Transitions,
+    targets: FloatArray,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+) -> tuple[KernelEmbedding | PivotedEmbedding, FloatArray]:
+    """The same where only predictions are asked for: in few features, where these are enough."""
+    inputs = state_actions(data, task)
+    kernel, regulariser, x = embedding_hyperparameters(
+        inputs, targets, state_kernel, task, start, rng
+    )
+    few = PivotedEmbedding.fit(kernel, inputs, regulariser)
+    return few or KernelEmbedding.fit(kernel, inputs, regulariser), x

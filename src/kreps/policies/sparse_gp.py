@@ -1,0 +1,160 @@
+"""A Gaussian process policy carried by few centres: what the control loop evaluates.
+
+It comes about in three ways: from an exact process, with all centres that its noise lets one tell
+apart (`CostSensitiveGP.predictor`) or so many (`CostSensitiveGP.compressed`), or from sums over any
+number of samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import Array, FloatArray, as_numpy, namespace
+from kreps.kernels.basis import RKHSBasis
+from kreps.kernels.kernel import Kernel
+from kreps.kernels.linalg import solve_lower_transposed
+
+ROWS = 128
+"""Of a triangular matrix that are multiplied at once."""
+
+
+@dataclass(frozen=True)
+class PolicySums:
+    """What weighted samples say about actions as a linear function of features z, (r,).
+
+    Attributes:
+        precision: (r, r), ``sum_i w_i z_i z_i'``.
+        pull: (r, da), ``sum_i w_i z_i u_i'``.
+    """
+
+    precision: FloatArray
+    pull: FloatArray
+
+    @classmethod
+    def of(cls, features: Array, weights: Array, targets: Array) -> PolicySums:
+        """Of features (n, r), weights (n,) and scaled actions (n, da), of any array library."""
+        root = namespace(features).sqrt(weights)[:, None]
+        weighted = root * features
+        return cls(as_numpy(weighted.T @ weighted), as_numpy(weighted.T @ (root * targets)))
+
+    def __add__(self, other: PolicySums) -> PolicySums:
+        return PolicySums(self.precision + other.precision, self.pull + other.pull)
+
+
+@dataclass(frozen=True)
+class SparseGP:
+    """Mean and variance of actions from the kernel values ``k`` of a state with r centres only.
+
+    Attributes:
+        task: gives centre, scale and limits of the actions.
+        kernel: over states.
+        states: (r, ds) the centres.
+        mean_weights: (r, da), the scaled mean is ``k' mean_weights``.
+        explained: (r, r), the explained variance is ``|explained k|^2``.
+        signal, noise: sf2 and l.
+    """
+
+    task: TaskSpec
+    kernel: Kernel
+    states: FloatArray
+    mean_weights: FloatArray
+    explained: FloatArray
+    signal: float
+    noise: float
+
+    @classmethod
+    def fit(
+        cls, task: TaskSpec, basis: RKHSBasis, sums: PolicySums, signal: float, noise: float
+    ) -> SparseGP:
+        """The posterior of the projected process (deterministic training conditional).
+
+        With features ``z(s)`` of the basis and ``P = I + (sf2 / l) sum_i w_i z_i z_i'``:
+        ``mu(s) = (sf2 / l) z(s)' P^-1 sum_i w_i z_i u_i`` and
+        ``sigma^2(s) = sf2 (1 - z(s)' z(s)) + sf2 z(s)' P^-1 z(s) + l``.
+        The first part of the variance is what the centres cannot represent; without it (subset
+        of regressors) the policy would grow sure of itself far from all data.
+        """
+        values, vectors = np.linalg.eigh(signal / noise * sums.precision)
+        values = np.maximum(values, 0.0)
+        mean = vectors @ ((vectors.T @ sums.pull) / (1.0 + values)[:, None])
+        # I - P^-1 = vectors diag(values / (1 + values)) vectors'
+        explained = np.sqrt(signal * values / (1.0 + values)) * vectors
+        return cls(
+            task,
+            basis.kernel,
+            basis.pivots,
+            np.ascontiguousarray(solve_lower_transposed(basis.lower, signal / noise * mean)),
+            np.ascontiguousarray(solve_lower_transposed(basis.lower, explained).T),
+            signal,
+            noise,
+        )
+
+    def narrowed(self, times: float) -> SparseGP:
+        """With a deviation so many times smaller, of process and noise alike: the mean stays."""
+        return replace(
+            self,
+            explained=self.explained / times,
+            signal=self.signal / times**2,
+            noise=self.noise / times**2,
+        )
+
+    @cached_property
+    def coordinates(self) -> FloatArray:
+        """Embedded centres (r, e)."""
+        return self.kernel.embed(self.states)
+
+    @cached_property
+    def _centred(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Mean (e,) of the coordinates, distances (r, e) from it, half of their squares (r,)."""
+        origin = self.coordinates.mean(axis=0)
+        centred = self.coordinates - origin
+        return origin, centred, 0.5 * np.sum(centred * centred, axis=1)
+
+    @cached_property
+    def _explained_rows(self) -> list[FloatArray]:
+        """`explained` in pieces, of which a triangular one has fewer columns: half the work."""
+        triangular = len(self.explained) > ROWS and not np.triu(self.explained, 1).any()
+        if not triangular:
+            return [self.explained]
+        starts = range(0, len(self.explained), ROWS)
+        return [self.explained[i : i + ROWS, : i + ROWS] for i in starts]
+
+    def greedy(self, states: FloatArray) -> FloatArray:
+        """Mean action (m, da) at states (m, ds), in the task's units, not clipped."""
+        return self.task.unscaled(self._mean(self._covariances(states)))
+
+    def standard_deviation(self, states: FloatArray) -> FloatArray:
+        """Standard deviation (m, da) of the commanded action, in the task's units."""
+        return self._deviation(self._covariances(states))[:, None] * self.task.action_scale
+
+    def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
+        k = self._covariances(states)
+        return self.task.unscaled(self._mean(k) + self._deviation(k)[:, None] * noise)
+
+    def _covariances(self, states: FloatArray) -> FloatArray:
+        """Kernel values (r, m) of the centres with states (m, ds).
+
+        As `gaussian_gram` of both, but what depends on the centres alone is not computed again
+        in each cycle.
+        """
+        origin, centred, half_squares = self._centred
+        f = self.kernel.embed(states) - origin
+        k = centred @ f.T
+        k -= half_squares[:, None]
+        k -= 0.5 * np.sum(f * f, axis=1)
+        np.minimum(k, 0.0, out=k)
+        return np.exp(k, out=k)
+
+    def _mean(self, k: FloatArray) -> FloatArray:
+        return k.T @ self.mean_weights
+
+    def _deviation(self, k: FloatArray) -> FloatArray:
+        variance = np.full(k.shape[1], self.signal)
+        for rows in self._explained_rows:
+            explained = rows @ k[: rows.shape[1]]
+            variance -= np.einsum("ij,ij->j", explained, explained)
+        return np.sqrt(np.maximum(variance, 0.0) + self.noise)
