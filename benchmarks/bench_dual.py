@@ -15,7 +15,7 @@ from kreps.algorithms.reps import stationarity_ridge
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import RKHSBasis
 from kreps.models.transition import feature_differences, state_kernel, successor_features
-from kreps.settings import RECIPES
+from kreps.settings import PRESETS
 
 
 class Counting(DualProblem):
@@ -54,7 +54,7 @@ def bench_newton_iteration(measure: Measure, n: int) -> None:
 def bench_newton_solve(measure: Measure) -> None:
     """From a cold start, on features and rewards of the swing-up."""
     data = swing_up(1500)
-    learner, transitions, observed = data.learner, data.transitions, RECIPES["observed"]
+    learner, transitions, observed = data.learner, data.transitions, PRESETS["observed"]
     kernel = state_kernel(transitions, learner.task, np.random.default_rng(0))
     basis, features = RKHSBasis.fit(kernel, transitions.points, tolerance=0.0, max_rank=300)
     assert features.shape[1] == 300, basis.residual

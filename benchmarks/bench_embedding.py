@@ -8,7 +8,7 @@ from criteria import Seconds, Share
 from data import swing_up
 from measuring import Measure
 
-from kreps.algorithms.reps import PolicySamples, policy_hyperparameters, value_basis
+from kreps.algorithms.reps import PolicyTargets, policy_hyperparameters, value_basis
 from kreps.kernels.hyperparameters import EmbeddingLoss, PolicyLoss, factor_distances
 from kreps.kernels.kernel import Kernel, SquaredExponential, median_lengthscales
 from kreps.kernels.regression import KernelEmbedding
@@ -35,7 +35,7 @@ class Prepared:
         factors = (*self.kernel.factors, SquaredExponential((self.inputs.shape[1] - 1,)))
         self.input_kernel = Kernel(factors, median_lengthscales(factors, self.inputs, RNG(1)))
         p = RNG(2).uniform(0.2, 1.0, N)
-        self.samples = PolicySamples.of(self.transitions, p / p.sum(), self.task)
+        self.samples = PolicyTargets.of(self.transitions, p / p.sum(), self.task)
 
 
 def bench_embedding(measure: Measure) -> None:

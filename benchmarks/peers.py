@@ -154,7 +154,7 @@ SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
 
 
 @dataclass(frozen=True)
-class Cell:
+class Trial:
     """What one worker is asked to do.
 
     Attributes:
@@ -225,7 +225,7 @@ def training_environment(name: str) -> Environment:
     return gym.wrappers.RescaleAction(env, -one, one)
 
 
-def model_of(cell: Cell) -> Any:
+def model_of(cell: Trial) -> Any:
     """The untrained learner of a cell, with its environments."""
     from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
@@ -311,7 +311,7 @@ class Judge:
     Learning ends after the last mark.
     """
 
-    def __init__(self, cell: Cell, model: Any) -> None:
+    def __init__(self, cell: Trial, model: Any) -> None:
         self.cell, self.model = cell, model
         self.env = gym.make(TASKS[cell.task].environment)
         self.task = task_of(self.env)
@@ -362,7 +362,7 @@ class Judge:
         return found
 
 
-def run_cell(cell: Cell) -> dict[str, Any]:
+def run_cell(cell: Trial) -> dict[str, Any]:
     """Learn and judge: the cell's description, one row per mark, and the versions used."""
     import torch
 
@@ -395,7 +395,7 @@ def read(path: Path) -> dict[str, Any]:
         raise SystemExit(f"{path} is damaged ({error}); remove it to run the cell again") from error
 
 
-def left_of(cell: Cell, folder: Path) -> Cell | None:
+def left_of(cell: Trial, folder: Path) -> Trial | None:
     """What is to be run; None if it is there.
 
     A cell that is there with other marks is run again with those and the new ones.
@@ -442,7 +442,7 @@ def gather(folder: Path, path: Path) -> int:
 # ---- the command line -------------------------------------------------------------------------
 
 
-def run_cells(cells: Sequence[Cell], workers: int, folder: Path) -> dict[str, BaseException]:
+def run_trials(cells: Sequence[Trial], workers: int, folder: Path) -> dict[str, BaseException]:
     """Run what is not in the folder yet; the errors of the cells that failed, by name."""
     left = [todo for cell in cells if (todo := left_of(cell, folder)) is not None]
     count = len(cells) - len(left)
@@ -548,13 +548,13 @@ def main() -> None:
     seeds = dict.fromkeys(seed for part in options.seeds for seed in part)
     marks = tuple(sorted(set(options.marks)))
     cells = [
-        Cell(task, learner, seed, marks)
+        Trial(task, learner, seed, marks)
         for seed in seeds  # seed by seed, so that partial results compare
         for task in dict.fromkeys(options.tasks)
         for learner in dict.fromkeys(options.learners)
     ]
     folder = options.out / "cells" / "peers"
-    failures = run_cells(cells, options.workers, folder)
+    failures = run_trials(cells, options.workers, folder)
     count = gather(folder, options.out / "peers.json")
     print(f"{options.out / 'peers.json'} has {count} cells")
     if failures:

@@ -20,7 +20,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from peers import MARKS, TASKS, Cell, Stopwatch, add_tasks, model_of, positive, seeds_of, write
+from peers import MARKS, TASKS, Stopwatch, Trial, add_tasks, model_of, positive, seeds_of, write
 
 import kreps
 from kreps.app.run_folder import versions
@@ -50,7 +50,7 @@ def seconds_of_sac(task: str, seed: int, steps: int) -> tuple[float, float]:
 
     torch.set_num_threads(1)
     with blas_threads(1):
-        model = model_of(Cell(task, "sac", seed, (steps,)))
+        model = model_of(Trial(task, "sac", seed, (steps,)))
         watch = Stopwatch()
         model.learn(steps)
         with watch.paused() as now:

@@ -6,7 +6,7 @@ Times one call after the other, as a robot makes them, on one BLAS thread with g
 on, for policies of 1500 support points on the swing-up (processor time beside that of the clock: a
 busy neighbour shows in the latter only):
 
-- learnt: the support points of a learnt policy, the heaviest 1500;
+- learnt: the support points of a learnt policy, the top_by_weight 1500;
 - rough: the same with lengthscales so short that no support point can be spared;
 - compressed: the learnt one on 50 centres.
 
@@ -56,7 +56,7 @@ def learner_of(seed: int) -> kreps.KREPS:
     return kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=seed)
 
 
-def heaviest(policy: CostSensitiveGP, count: int) -> CostSensitiveGP:
+def top_by_weight(policy: CostSensitiveGP, count: int) -> CostSensitiveGP:
     """The policy of its ``count`` samples of most weight."""
     rows = np.sort(np.argsort(-policy.weights, kind="stable")[:count])
     return replace(
@@ -75,7 +75,7 @@ def policies_to_time() -> dict[str, kreps.Policy]:
             raise SystemExit(f"no policy of 40 updates has {SUPPORT} support points")
         process = learner.learn(1, progress=False).policy.process
         assert isinstance(process, CostSensitiveGP)
-    learnt = rough = heaviest(process, SUPPORT)
+    learnt = rough = top_by_weight(process, SUPPORT)
     while len(rough.predictor.states) < SUPPORT:
         rough = replace(rough, kernel=rough.kernel.with_lengthscales(rough.kernel.lengthscales / 2))
     policies = {"learnt": kreps.Policy(learnt), "rough": kreps.Policy(rough)}

@@ -38,7 +38,7 @@ from kreps.algorithms.state import LearnerState
 from kreps.app.plots import BLUE, GREY, ORANGE, STYLE
 from kreps.data.rollout import Rollout
 from kreps.data.task import TaskSpec
-from kreps.data.window import Window
+from kreps.data.window import ReplayWindow
 from kreps.envs.restart import restart_length
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import KernelExpansion, RKHSBasis
@@ -182,7 +182,7 @@ def show(figure: Figure, name: str) -> None:
 rng = np.random.default_rng(args.seed)
 explorer = Gaussian(task, spread=0.7)  # in units of the largest velocity
 rollouts = simulate(explorer, args.rollouts, rng)
-data = Window(args.rollouts).extend(rollouts).transitions
+data = ReplayWindow(args.rollouts).extend(rollouts).transitions
 n = len(data)
 states, actions = data.states[:, 0], data.actions[:, 0]
 
@@ -477,7 +477,7 @@ value = basis.function(reward_unit * dual.theta)  # in units of the reward
 greedy_p = sample_weights(problem.rewards, dual.eta)  # as if there were no future
 
 
-def surplus(weights: FloatArray) -> FloatArray:
+def exploration_bonus(weights: FloatArray) -> FloatArray:
     """phi(s)' B'p over the grid: arrivals less visits, seen through the kernel."""
     return on_grid @ (problem.differences.T @ weights)
 
@@ -499,8 +499,8 @@ with rc_context(STYLE):
     c.set_ylabel("[units of r]")
     c.set_title("Value function V and reward")
     d.axhline(0.0, color=GREY, lw=0.8, ls="--", zorder=0)
-    d.plot(GRID, surplus(greedy_p), color=GREY, label="weights from rewards alone")
-    d.plot(GRID, surplus(p), color=BLUE, label="weights with V")
+    d.plot(GRID, exploration_bonus(greedy_p), color=GREY, label="weights from rewards alone")
+    d.plot(GRID, exploration_bonus(p), color=BLUE, label="weights with V")
     position_axis(d)
     d.legend(loc="upper center")
     d.margins(y=0.25)
@@ -531,7 +531,7 @@ show(figure, "5_weights")
 # the average reward per step, from 500 fresh roll-outs each.
 
 # %%
-support = reps.PolicySamples.of(data, p, task)
+support = reps.PolicyTargets.of(data, p, task)
 policy_x = reps.policy_hyperparameters(support, kernel, settings, None, update_rng)
 policy = reps.fit_policy(support, kernel, task, policy_x)
 new_rollouts = simulate(policy, args.rollouts, np.random.default_rng([args.seed, 2]))
@@ -576,7 +576,7 @@ show(figure, "6_policy")
 # others.
 
 # %%
-start = LearnerState(Window(args.rollouts))
+start = LearnerState(ReplayWindow(args.rollouts))
 learnt, _ = reps.update(start, rollouts, task, settings, np.random.default_rng([args.seed, 1]))
 assert isinstance(learnt.policy, CostSensitiveGP)
 same = np.array_equal(learnt.policy.mean(GRID[:, None]), policy.mean(GRID[:, None]))

@@ -36,12 +36,12 @@ from kreps.kernels.arrays import (
 from kreps.kernels.basis import Basis, FourierBasis, RBFGrid, RKHSBasis
 from kreps.kernels.gram import gaussian_gram
 from kreps.kernels.kernel import (
-    CutAngle,
     Factor,
     Kernel,
     Periodic,
     SmoothedImage,
     SquaredExponential,
+    WrapAngle,
     factors_of,
 )
 from kreps.kernels.linalg import cholesky, solve_lower, solve_lower_transposed, with_diagonal
@@ -121,7 +121,7 @@ def test_rows_and_columns_are_taken_in_any_order_and_twice() -> None:
     [
         SquaredExponential((0, 2)),
         Periodic((1,)),
-        CutAngle((1,), 0.5),
+        WrapAngle((1,), 0.5),
         SmoothedImage(tuple(range(12)), (3, 4)),
     ],
     ids=lambda factor: type(factor).__name__,
@@ -296,10 +296,10 @@ def streamed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def updated(
-    rollouts: list[Rollout], place: Callable[[FloatArray], Array] = as_float, **settings: Any
+    rollouts: list[Rollout], to_device: Callable[[FloatArray], Array] = as_float, **settings: Any
 ) -> tuple[kreps.KREPS, UpdateInfo]:
     settings = {"recipe": "observed", **settings}
-    learner = kreps.KREPS(TASK, compute=Compute(to_device=place), **settings)
+    learner = kreps.KREPS(TASK, compute=Compute(to_device=to_device), **settings)
     info = learner.update(rollouts)
     assert isinstance(info, UpdateInfo)
     return learner, info
@@ -352,12 +352,12 @@ def test_an_update_in_another_library_is_the_same(
     settings = SETTINGS | variant
     seen: list[Array] = []
 
-    def place(values: FloatArray) -> Array:
+    def to_device(values: FloatArray) -> Array:
         seen.append(strict(values))
         return seen[-1]
 
     wanted = updated(rollouts, **settings)
-    found = updated(rollouts, place, **settings)
+    found = updated(rollouts, to_device, **settings)
     states = np.concatenate([r.observations for r in rollouts])
     assert_same_update(found, wanted, states)
     assert sum(each.shape[0] for each in seen) > 5 * len(states)
@@ -381,9 +381,9 @@ def test_an_update_from_images_in_another_library_is_the_same() -> None:
     weights = []
     # the numbers that the search chose for images
     settings = settings_of("observed", kl_bound=0.5, ridge=0.01, eta_floor=0.02)
-    for place in (as_float, strict):
+    for to_device in (as_float, strict):
         learner = kreps.KREPS(
-            task, recipe=settings, approximation="pivoted", compute=Compute(to_device=place)
+            task, recipe=settings, approximation="pivoted", compute=Compute(to_device=to_device)
         )
         weights.append(learner.update(given).dual.weights)  # type: ignore[attr-defined]
     assert len(weights[0]) > 200
@@ -394,10 +394,10 @@ def test_an_update_from_images_in_another_library_is_the_same() -> None:
 def test_an_update_in_pytorch_is_the_same(rollouts: list[Rollout]) -> None:
     torch = pytest.importorskip("torch")
 
-    def place(values: FloatArray) -> Array:
+    def to_device(values: FloatArray) -> Array:
         return torch.asarray(values)
 
-    found = updated(rollouts, place, **SETTINGS)
+    found = updated(rollouts, to_device, **SETTINGS)
     states = np.concatenate([r.observations for r in rollouts])
     assert_same_update(found, updated(rollouts, **SETTINGS), states)
     with pytest.raises(NumericalError):

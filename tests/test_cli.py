@@ -83,7 +83,7 @@ def call(*arguments: str | Path) -> tuple[int, str]:
     return code or 0, text
 
 
-def refused(*arguments: str | Path) -> str:
+def rejected(*arguments: str | Path) -> str:
     """What is said by a command that ends with exit code 2."""
     code, text = call(*arguments)
     assert code == 2, text
@@ -192,7 +192,7 @@ def test_seed_recipe_and_periodic_reach_the_learner(tmp_path: Path) -> None:
     assert learner.seed == 5 and learner.task.periodic == (0, 2)
     settings = learner.settings
     assert settings.model == "sample" and settings.kl_bound == 0.25 and settings.window == 6
-    assert settings.policy_fit == kreps.RECIPES["paper"].policy_fit
+    assert settings.policy_fit == kreps.PRESETS["paper"].policy_fit
     code, text = call("resume", run, "--iterations", "3", "--no-report")
     assert code == 0, text
     assert kreps.KREPS.resume(run / "checkpoint.safetensors").task.periodic == (0, 2)
@@ -223,7 +223,7 @@ def test_a_whole_training_leaves_all_promised_files_and_says_so(
 
 def test_a_run_is_not_overwritten(run: Path) -> None:
     before = {p.name: p.read_bytes() for p in run.iterdir()}
-    text = refused("train", NAME, "--out", run, *TINY)
+    text = rejected("train", NAME, "--out", run, *TINY)
     assert "holds a run already" in text
     assert "kreps resume" in text and "another folder" in text
     assert {p.name: p.read_bytes() for p in run.iterdir()} == before
@@ -268,16 +268,16 @@ def test_an_empty_folder_may_be_used(tmp_path: Path) -> None:
 def test_mistakes_are_named_and_leave_no_folder(
     arguments: list[str], says: str, tmp_path: Path
 ) -> None:
-    text = refused("train", *arguments, "--out", tmp_path / "run")
+    text = rejected("train", *arguments, "--out", tmp_path / "run")
     assert says in text
     assert not (tmp_path / "run").exists()
 
 
 def test_train_needs_a_folder(tmp_path: Path) -> None:
-    assert "--out" in refused("train", NAME)
+    assert "--out" in rejected("train", NAME)
     (tmp_path / "file").write_text("")
-    assert "file" in refused("train", NAME, "--out", tmp_path / "file", *TINY)
-    assert "file" in refused("train", NAME, "--out", tmp_path / "file" / "run", *TINY)
+    assert "file" in rejected("train", NAME, "--out", tmp_path / "file", *TINY)
+    assert "file" in rejected("train", NAME, "--out", tmp_path / "file" / "run", *TINY)
 
 
 # ---- resume -----------------------------------------------------------------------------------
@@ -301,7 +301,7 @@ def test_a_run_that_stopped_before_its_first_update_can_be_resumed(
     for name in RUN_FILES - {"config.json"}:
         (run / name).unlink()
     for command in ("evaluate", "plot", "video"):
-        assert "kreps resume" in refused(command, run)
+        assert "kreps resume" in rejected(command, run)
     assert call("resume", run, "--no-report")[0] == 0
     name = "policy.safetensors"
     assert (run / name).read_bytes() == (trained / name).read_bytes()
@@ -343,7 +343,7 @@ def test_an_environment_that_fails_can_be_mended_and_the_run_resumed(
     run = tmp_path / "run"
     assert train(run, environment="kreps-tests/Short-v0", iterations=1)[0] == 0
     monkeypatch.setattr(Short, "fails", True)
-    text = refused("resume", run, "--iterations", "2")
+    text = rejected("resume", run, "--iterations", "2")
     assert "the cable came off" in text and "kreps resume" in text
     assert iteration(run) == 1
     monkeypatch.setattr(Short, "fails", False)
@@ -375,8 +375,8 @@ def test_evaluate_measures_both_policies(run: Path) -> None:
         assert found[name]["standard_error"] == pytest.approx(mine.standard_error, rel=1e-6)
         assert f"{mine.mean:.4f}" in text
     assert found["seed"] == 4 and found["iteration"] == 2
-    assert "--episodes" in refused("evaluate", run, "--episodes", "1")
-    assert "--steps" in refused("evaluate", run, "--steps", "0")
+    assert "--episodes" in rejected("evaluate", run, "--episodes", "1")
+    assert "--steps" in rejected("evaluate", run, "--steps", "0")
 
 
 def test_plot_draws_with_and_without_an_evaluation(run: Path) -> None:
@@ -409,7 +409,7 @@ def test_films_that_cannot_be_written_are_refused(
     out: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert out in refused("video", run, "--steps", "2", "--out", out)
+    assert out in rejected("video", run, "--steps", "2", "--out", out)
 
 
 def test_a_film_into_a_missing_folder_is_made_or_refused(run: Path, tmp_path: Path) -> None:
@@ -421,8 +421,8 @@ def test_a_film_into_a_missing_folder_is_made_or_refused(run: Path, tmp_path: Pa
 def test_pictures_that_cannot_be_written_are_an_error_of_the_library(run: Path) -> None:
     for name in ("learning_curve.png", "video.gif"):
         (run / name).mkdir()
-    assert "learning_curve.png" in refused("plot", run)
-    assert "video.gif" in refused("video", run, "--steps", "2")
+    assert "learning_curve.png" in rejected("plot", run)
+    assert "video.gif" in rejected("video", run, "--steps", "2")
 
 
 def test_an_environment_that_cannot_be_drawn_still_gets_its_report(tmp_path: Path) -> None:
@@ -433,7 +433,7 @@ def test_an_environment_that_cannot_be_drawn_still_gets_its_report(tmp_path: Pat
     assert "1 updates from 6 roll-outs" in text
     assert (run / "learning_curve.png").exists()
     assert not (run / "policy_maps.png").exists()  # three-dimensional states
-    assert "pygame is not installed" in refused("video", run)
+    assert "pygame is not installed" in rejected("video", run)
 
 
 # ---- export -----------------------------------------------------------------------------------
@@ -532,7 +532,7 @@ def test_exports_that_cannot_be_served_are_refused_and_leave_nothing(
     pytest.importorskip("onnx")
     before = (run / "policy.safetensors").read_bytes()
     monkeypatch.chdir(tmp_path)
-    assert says in refused("export", run, *arguments)
+    assert says in rejected("export", run, *arguments)
     assert [path.name for path in tmp_path.iterdir()] == ["run"]
     assert {path.name for path in run.iterdir()} == RUN_FILES
     assert (run / "policy.safetensors").read_bytes() == before
@@ -540,12 +540,12 @@ def test_exports_that_cannot_be_served_are_refused_and_leave_nothing(
 
 def test_exports_of_what_holds_no_policy_are_refused(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "x.onnx"
-    assert "not a run folder" in refused("export", tmp_path, "--out", out)
-    assert "check the path" in refused("export", tmp_path / "missing", "--out", out)
+    assert "not a run folder" in rejected("export", tmp_path, "--out", out)
+    assert "check the path" in rejected("export", tmp_path / "missing", "--out", out)
     checkpoint = run / "checkpoint.safetensors"
-    assert "it is a kreps checkpoint" in refused("export", checkpoint, "--out", out)
+    assert "it is a kreps checkpoint" in rejected("export", checkpoint, "--out", out)
     (run / "policy.safetensors").unlink()
-    assert "kreps resume" in refused("export", run, "--out", out)
+    assert "kreps resume" in rejected("export", run, "--out", out)
     assert not out.exists()
 
 
@@ -553,7 +553,7 @@ def test_a_compressed_policy_is_not_compressed_again(run: Path, tmp_path: Path) 
     small = tmp_path / "small.safetensors"
     call("export", run, "--centres", "5", "--out", small)
     out = tmp_path / "x.safetensors"
-    text = refused("export", small, "--centres", "3", "--out", out)
+    text = rejected("export", small, "--centres", "3", "--out", out)
     assert "5 centres" in text and "rank = 3" in text
     assert call("export", small, "--centres", "5", "--out", out)[0] == 0
     assert out.read_bytes() == small.read_bytes()
@@ -568,14 +568,14 @@ ON_RUNS = ["resume", "evaluate", "plot", "video"]
 def test_a_folder_that_is_no_run_is_refused_with_a_remedy(command: str, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("hello")
     for place in (tmp_path, tmp_path / "missing", tmp_path / "file"):
-        text = refused(command, place)
+        text = rejected(command, place)
         assert "not a run folder" in text and "kreps train" in text
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 @pytest.mark.parametrize("name", ["run[/red]", "run[red]"])
 def test_brackets_in_a_path_are_no_markup(name: str, tmp_path: Path) -> None:
-    assert name in refused("resume", tmp_path / name)
+    assert name in rejected("resume", tmp_path / name)
 
 
 def test_brackets_in_a_path_are_no_markup_where_all_is_well(
@@ -626,23 +626,23 @@ CONFIG = {
 )
 def test_a_damaged_configuration_is_an_error_of_the_library(content: str, tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(content)
-    refused("resume", tmp_path, "--no-report")
+    rejected("resume", tmp_path, "--no-report")
 
 
 @pytest.mark.parametrize("command", ON_RUNS)
 def test_a_damaged_checkpoint_is_an_error_of_the_library(command: str, run: Path) -> None:
     checkpoint = run / "checkpoint.safetensors"
     checkpoint.write_bytes(checkpoint.read_bytes()[:-100])
-    assert "checkpoint" in refused(command, run)
+    assert "checkpoint" in rejected(command, run)
     checkpoint.write_bytes((run / "policy.safetensors").read_bytes())
-    assert "it is a kreps policy" in refused(command, run)
+    assert "it is a kreps policy" in rejected(command, run)
 
 
 def test_a_checkpoint_of_another_task_is_refused(run: Path, tmp_path: Path) -> None:
     other = tmp_path / "other"
     train(other, environment="kreps-tests/Short-v0", iterations=1)
     shutil.copy(other / "checkpoint.safetensors", run / "checkpoint.safetensors")
-    assert "learnt in" in refused("resume", run)
+    assert "learnt in" in rejected("resume", run)
 
 
 def _without_column(text: str) -> str:

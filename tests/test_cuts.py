@@ -13,13 +13,13 @@ import kreps
 from kreps.data.rollout import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.kernel import CutAngle, Kernel, Periodic
+from kreps.kernels.kernel import Kernel, Periodic, WrapAngle
 from kreps.models.transition import (
-    CUT_LENGTHSCALE,
+    WRAP_LENGTHSCALE,
     fit_regression,
     state_actions,
     state_kernel,
-    with_cuts,
+    with_wrap_discontinuity,
 )
 
 TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]), periodic=(0,))
@@ -37,25 +37,28 @@ def turning(begin: float, samples: int = 400, turns: float = 1.0) -> Transitions
 
 def kernels_of(data: Transitions, settings: kreps.Settings) -> tuple[Kernel, Kernel]:
     kernel = state_kernel(data, TASK, np.random.default_rng(0))
-    return kernel, with_cuts(kernel, data, TASK, settings)
+    return kernel, with_wrap_discontinuity(kernel, data, TASK, settings)
 
 
 @pytest.mark.parametrize("begin", [-np.pi, -0.5 * np.pi, 0.0, 4.0])
 def test_the_cut_lies_in_the_gap_that_the_angles_leave(begin: float) -> None:
     kernel, cut = kernels_of(turning(begin), kreps.Settings())
     factor = cut.factors[-1]
-    assert isinstance(factor, CutAngle) and factor.dims == (0,)
+    assert isinstance(factor, WrapAngle) and factor.dims == (0,)
     assert abs(factor.begin - begin) <= TURN / 401
-    sides = begin + np.array([[-0.1, 0.0], [0.1, 0.0]])
-    inside = sides + np.array([1.0, 0.0])
-    alike = kernel.gram(sides[:1], sides[1:])[0, 0]
+    residual_signs = begin + np.array([[-0.1, 0.0], [0.1, 0.0]])
+    inside = residual_signs + np.array([1.0, 0.0])
+    alike = kernel.gram(residual_signs[:1], residual_signs[1:])[0, 0]
     assert kernel.gram(inside[:1], inside[1:])[0, 0] == pytest.approx(alike)
     # across the cut they are nearly a turn apart, elsewhere as near as before
-    apart = np.exp(-0.5 * ((TURN - 0.2) / CUT_LENGTHSCALE) ** 2)
-    assert cut.gram(sides[:1], sides[1:])[0, 0] == pytest.approx(alike * apart)
+    apart = np.exp(-0.5 * ((TURN - 0.2) / WRAP_LENGTHSCALE) ** 2)
+    assert cut.gram(residual_signs[:1], residual_signs[1:])[0, 0] == pytest.approx(alike * apart)
     assert cut.gram(inside[:1], inside[1:])[0, 0] == pytest.approx(alike, rel=0.01)
     # whole turns are not felt: roll-outs in the model do not come back into the range
-    np.testing.assert_allclose(cut.gram(sides + np.array([3 * TURN, 0.0]), sides), cut.gram(sides))
+    np.testing.assert_allclose(
+        cut.gram(residual_signs + np.array([3 * TURN, 0.0]), residual_signs),
+        cut.gram(residual_signs),
+    )
 
 
 def test_angles_that_count_their_turns_are_not_cut() -> None:
@@ -79,7 +82,7 @@ def test_the_recipe_of_the_paper_is_round() -> None:
     value = learner.learn(1, progress=False).state.value
     assert value is not None
     assert isinstance(value.kernel.factors[0], Periodic)
-    assert not any(isinstance(factor, CutAngle) for factor in value.kernel.factors)
+    assert not any(isinstance(factor, WrapAngle) for factor in value.kernel.factors)
 
 
 def expected_rewards(data: Transitions, kernel: Kernel, around: FloatArray) -> FloatArray:
@@ -94,12 +97,12 @@ def expected_rewards(data: Transitions, kernel: Kernel, around: FloatArray) -> F
 
 def test_a_reward_of_the_number_is_learnt_up_to_the_cut() -> None:
     data = turning(-0.5 * np.pi)
-    beside = np.array([-0.5 * np.pi + 0.05, 1.5 * np.pi - 0.05])
-    missed, missed_cut = (
-        np.abs(expected_rewards(data, kernel, beside) + beside**2).max()
+    concat = np.array([-0.5 * np.pi + 0.05, 1.5 * np.pi - 0.05])
+    loo_residuals, missed_cut = (
+        np.abs(expected_rewards(data, kernel, concat) + concat**2).max()
         for kernel in kernels_of(data, kreps.Settings())
     )
-    assert missed > 1.0
+    assert loo_residuals > 1.0
     assert missed_cut < 0.05
 
 
@@ -120,12 +123,12 @@ def test_the_value_function_jumps_with_the_reward_and_survives_a_checkpoint(
     for angles in ("cut", "round"):
         learner = kreps.KREPS(env, seed=1, angles=angles, approximation=approximation)
         learner.learn(2, progress=False)
-        sides = np.array([[1.5 * np.pi - 0.01, 8.0], [-0.5 * np.pi + 0.01, 8.0]])
-        low, high = learner.value_function(sides)
+        residual_signs = np.array([[1.5 * np.pi - 0.01, 8.0], [-0.5 * np.pi + 0.01, 8.0]])
+        low, high = learner.value_function(residual_signs)
         jumps[angles] = high - low
         learner.save(tmp_path / angles)
         again = kreps.KREPS.resume(tmp_path / angles, env)
-        np.testing.assert_array_equal(again.value_function(sides), [low, high])
+        np.testing.assert_array_equal(again.value_function(residual_signs), [low, high])
         assert again.learn(1, progress=False).state.iteration == 3
     # the reward does by 10 ((3 pi / 2)^2 - (pi / 2)^2), 197, and V has some of it after two updates
     assert jumps["cut"] > 40.0 > 5.0 * abs(jumps["round"])

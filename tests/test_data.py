@@ -10,7 +10,7 @@ import pytest
 
 from kreps.data.rollout import Rollout, Transitions
 from kreps.data.task import TaskSpec
-from kreps.data.window import Window
+from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import FloatArray
 
@@ -191,7 +191,7 @@ def test_only_the_last_step_of_a_terminated_rollout_is_an_end() -> None:
 
 def test_the_window_forgets_the_oldest_rollouts() -> None:
     rollouts = [rollout(1 + i, i) for i in range(7)]
-    empty = Window(4)
+    empty = ReplayWindow(4)
     first = empty.extend(rollouts[:3])
     second = first.extend(rollouts[3:5])
     third = second.extend(rollouts[5:])
@@ -205,7 +205,7 @@ def test_the_window_forgets_the_oldest_rollouts() -> None:
 
 def test_more_rollouts_than_the_window_holds_leave_the_latest() -> None:
     rollouts = [rollout(1 + i, i) for i in range(5)]
-    assert [len(r) for r in Window(2).extend(iter(rollouts)).rollouts] == [4, 5]
+    assert [len(r) for r in ReplayWindow(2).extend(iter(rollouts)).rollouts] == [4, 5]
 
 
 def test_many_groups_of_angles_are_checked_in_no_time() -> None:

@@ -100,7 +100,7 @@ def test_every_form_holds_the_same_transitions(form: Form, tmp_path: Path) -> No
     assert len(found) == sum(LENGTHS) == 31
     parts = [chunk.load() for chunk in found.chunks]
     assert [len(part) for part in parts] == [len(chunk) for chunk in found.chunks]
-    assert_same(Transitions.joined(parts), Transitions.of(ROLLOUTS))
+    assert_same(Transitions.concat(parts), Transitions.of(ROLLOUTS))
 
 
 @pytest.mark.parametrize("form", [from_memory, from_arrays])
@@ -308,7 +308,7 @@ def test_sizes_that_do_not_fit_together_are_refused(changes: dict[str, Any]) -> 
         Dataset.from_arrays(**(arrays(ROLLOUTS) | changes))
 
 
-def refused(found: Dataset, reason: str) -> None:
+def rejected(found: Dataset, reason: str) -> None:
     """By a learner, which stays as it was."""
     learner = kreps.KREPS(TASK)
     with pytest.raises(DataError, match=reason):
@@ -322,7 +322,7 @@ def refused(found: Dataset, reason: str) -> None:
 def test_numbers_that_are_no_data_are_refused_by_name(name: str, bad: float) -> None:
     given = arrays(ROLLOUTS)
     given[name][-1] = bad
-    refused(Dataset.from_arrays(**given), name)
+    rejected(Dataset.from_arrays(**given), name)
 
 
 @pytest.mark.parametrize(("ds", "da"), [(2, 2), (4, 2), (3, 1), (3, 3)])
@@ -335,11 +335,11 @@ def test_a_set_of_another_width_than_the_task_is_refused(
     if form == "files":
         kreps.save_rollouts(ROLLOUTS, tmp_path / "a.safetensors")
         kreps.save_rollouts(strangers, tmp_path / "b.safetensors")
-        refused(kreps.rollout_folder(tmp_path), reason)
+        rejected(kreps.rollout_folder(tmp_path), reason)
     elif form == "arrays":
-        refused(Dataset.from_arrays(**arrays(strangers)), reason)
+        rejected(Dataset.from_arrays(**arrays(strangers)), reason)
     else:
-        refused(Dataset.of(strangers), reason)
+        rejected(Dataset.of(strangers), reason)
 
 
 @pytest.mark.parametrize(("ds", "da"), [(2, 2), (3, 1)])

@@ -340,10 +340,10 @@ def test_a_floor_lower_than_was_found_to_pay_is_not_suggested(
 
 
 def test_policies_that_the_model_refuses_are_counted() -> None:
-    refused = [1.0] * 7 + [0.0, 1.0, 0.0, 0.0, 1.0]
-    assert finding("judgement", refused=refused).value == pytest.approx(0.4)
-    assert finding("judgement", refused=refused).severity == "fine"
-    found = finding("judgement", refused=1.0)
+    rejected = [1.0] * 7 + [0.0, 1.0, 0.0, 0.0, 1.0]
+    assert finding("judgement", rejected=rejected).value == pytest.approx(0.4)
+    assert finding("judgement", rejected=rejected).severity == "fine"
+    found = finding("judgement", rejected=1.0)
     assert found.severity == "note" and "100%" in found.sentence and found.remedy
 
 
@@ -451,7 +451,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         clipped=0.25,
         eta_floor=0.1,
         ridge=0.03,
-        refused=True,
+        rejected=True,
         seconds={},
     )
     learner: Any = SimpleNamespace(settings=Settings(max_rank=70), exploring=True)

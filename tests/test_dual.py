@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from kreps.algorithms.dual import (
-    ETA_LEAST,
+    MIN_ETA,
     DualProblem,
     DualSolution,
     Moments,
@@ -717,4 +717,4 @@ def test_without_features_only_the_temperature_is_found() -> None:
 
 def test_a_temperature_that_waits_is_never_done() -> None:
     """`_newton` does not ask for the KL bound then: the decrement alone has to forbid it."""
-    assert CENTRED * ETA_LEAST > DECREMENT_TOLERANCE
+    assert CENTRED * MIN_ETA > DECREMENT_TOLERANCE

@@ -15,11 +15,11 @@ from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.kernel import Kernel, SquaredExponential
 from kreps.kernels.regression import ROWS, FeatureRegression, KernelEmbedding
 from kreps.models.dynamics import (
+    DeltaStateTargets,
     Dynamics,
-    Motion,
+    expected_features_of_samples,
     fit_dynamics,
-    linear_trend,
-    observed_expectation,
+    linear_least_squares,
     state_changes,
 )
 from kreps.models.transition import state_actions, state_kernel
@@ -64,22 +64,24 @@ def test_coordinates_that_share_a_lengthscale_share_a_unit() -> None:
     observations[:, 1] = 0.0, 4.0, 0.0
     observations[:, 2] = 0.0, 0.5, 1.0  # and the last one never moves
     data = Transitions.of([Rollout(observations, np.zeros((2, 1)), np.zeros(2), terminated=True)])
-    motion = Motion.of(data, task)
-    np.testing.assert_allclose(motion.unit, [12.5**0.5, 12.5**0.5, 0.5, 1.0])
-    targets = motion.targets(data, task)
+    delta_targets = DeltaStateTargets.of(data, task)
+    np.testing.assert_allclose(delta_targets.scale, [12.5**0.5, 12.5**0.5, 0.5, 1.0])
+    targets = delta_targets.targets(data, task)
     np.testing.assert_array_equal(targets[:, -1], [0.0, 1.0])
-    np.testing.assert_allclose(motion.changes(targets), state_changes(data, task))
-    assert not motion.slopes.any()  # two samples are too few for a trend
+    np.testing.assert_allclose(delta_targets.changes(targets), state_changes(data, task))
+    assert not delta_targets.slopes.any()  # two samples are too few for a trend
 
 
 def test_what_is_linear_is_left_to_the_trend() -> None:
     data = pushes(20)
-    motion = Motion.of(data, TASK)
-    assert np.abs(motion.targets(data, TASK)).max() < 0.02  # 400 samples, and a ridge of one
+    delta_targets = DeltaStateTargets.of(data, TASK)
+    assert np.abs(delta_targets.targets(data, TASK)).max() < 0.02  # 400 samples, and a ridge of one
     # and goes on as a line where no sample ever was
     inputs = np.array([[50.0, 40.0, 1.0]])
     np.testing.assert_allclose(
-        motion.changes(motion.trend(inputs)), [[0.3 * 36.6, -4.0 + 0.6]], rtol=0.01
+        delta_targets.changes(delta_targets.linear_mean(inputs)),
+        [[0.3 * 36.6, -4.0 + 0.6]],
+        rtol=0.01,
     )
 
 
@@ -90,14 +92,14 @@ def test_actions_that_hardly_differ_have_no_slope() -> None:
     actions[17] = 0.967
     changes = -0.2 * states + 0.2 * actions + 0.1 * rng.normal(size=500)
     task = TaskSpec(1, np.array([-1.0]), np.array([1.0]))
-    slopes = linear_trend(np.column_stack([states, actions]), changes[:, None], task)
+    slopes = linear_least_squares(np.column_stack([states, actions]), changes[:, None], task)
     assert slopes[1, 0] == pytest.approx(-0.2, abs=0.02)
     assert abs(slopes[2, 0]) < 0.02
 
 
 def test_the_trend_is_not_in_angles_nor_in_ends() -> None:
     task = TaskSpec(2, np.array([-2.0]), np.array([2.0]), periodic=(0,))
-    slopes = Motion.of(pushes(20, ended=True), task).slopes
+    slopes = DeltaStateTargets.of(pushes(20, ended=True), task).slopes
     assert not slopes[1].any()
     assert not slopes[:, -1].any()
     assert slopes[2:, :-1].all()
@@ -106,9 +108,9 @@ def test_the_trend_is_not_in_angles_nor_in_ends() -> None:
 def test_a_coordinate_that_never_changes_has_no_slope() -> None:
     rng = np.random.default_rng(0)
     inputs = np.column_stack([rng.normal(size=50), np.full(50, 0.1) * 3.0, np.zeros(50)])
-    slopes = linear_trend(inputs, 2.0 * inputs[:, :1] + 1.0, TASK)
+    slopes = linear_least_squares(inputs, 2.0 * inputs[:, :1] + 1.0, TASK)
     np.testing.assert_allclose(slopes, [[1.0], [2.0], [0.0], [0.0]], atol=1e-5)
-    assert not linear_trend(inputs[:19], inputs[:19], TASK).any()  # ten for each of two
+    assert not linear_least_squares(inputs[:19], inputs[:19], TASK).any()  # ten for each of two
 
 
 def test_without_noise_it_says_where_any_action_leads() -> None:
@@ -146,21 +148,21 @@ def test_of_the_taken_actions_it_expects_the_observed_and_its_mirror_image() -> 
     dynamics, model = fitted(data, kernel)
     own, after = features[data.state], features[data.successor]
     start = features[data.start].mean(axis=0)
-    expected, errors = observed_expectation(data, basis, own, after, start, dynamics, TASK)
+    expected, errors = expected_features_of_samples(data, basis, own, after, start, dynamics, TASK)
     # what a model of all other samples says, one by one
-    targets = dynamics.motion.targets(data, TASK)
+    targets = dynamics.delta_targets.targets(data, TASK)
     for i in range(0, len(data), 17):
         rest = np.arange(len(data)) != i
         refit = type(model).fit(model.kernel, model.inputs[rest], model.regulariser)
         said = refit.strengths(model.inputs[i : i + 1])[:, 0] @ targets[rest]
-        said += dynamics.motion.trend(model.inputs[i : i + 1])[0]
-        predicted = data.states[i] + dynamics.motion.changes(said[None])
-        mirrored = 2.0 * predicted - data.points[data.successor[i]]
+        said += dynamics.delta_targets.linear_mean(model.inputs[i : i + 1])[0]
+        predict = data.states[i] + dynamics.delta_targets.changes(said[None])
+        mirrored = 2.0 * predict - data.points[data.successor[i]]
         np.testing.assert_allclose(
             expected[i], 0.5 * (after[i] + basis.features(mirrored)[0]), atol=1e-6
         )
         np.testing.assert_allclose(
-            errors.errors[i], after[i] - basis.features(predicted)[0], atol=1e-6
+            errors.errors[i], after[i] - basis.features(predict)[0], atol=1e-6
         )
         np.testing.assert_array_equal(errors.targets[i], after[i] - own[i])
 
@@ -197,7 +199,7 @@ def test_a_real_end_leads_to_the_start() -> None:
     def always(inputs: FloatArray) -> FloatArray:
         return np.full((len(inputs), 3), 1.7)  # more than certain
 
-    sure = Dynamics(dynamics.motion, always, dynamics.missed)
+    sure = Dynamics(dynamics.delta_targets, always, dynamics.loo_residuals)
     found = sure.expected_features(basis, start, np.arange(9), state_actions(data, TASK)[:9])
     np.testing.assert_allclose(found, np.tile(start, (9, 1)), atol=1e-12)
 
@@ -216,7 +218,9 @@ def test_ends_by_chance_are_expected_of_every_step() -> None:
     start = np.full(features.shape[1], 9.0)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
     own, observed = features[data.state], features[data.successor]
-    expected, errors = observed_expectation(data, basis, own, observed, start, dynamics, TASK)
+    expected, errors = expected_features_of_samples(
+        data, basis, own, observed, start, dynamics, TASK
+    )
     share = np.mean((expected - observed) / (start - observed), axis=1)
     assert share[data.terminated].mean() == pytest.approx(0.3, abs=0.06)
     assert share[~data.terminated].mean() == pytest.approx(0.3, abs=0.06)
@@ -239,7 +243,7 @@ def test_the_end_of_a_task_is_foreseen() -> None:
     data = Transitions.of(rollouts)
     kernel, basis, _ = basis_of(data)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
-    far, near = (dynamics.predict(np.array([[0.0, 0.0, a]]))[0, -1] for a in (0.9, -0.9))
+    far, near = (dynamics.regression(np.array([[0.0, 0.0, a]]))[0, -1] for a in (0.9, -0.9))
     assert far > 0.7 > 0.3 > near
     start = np.full(basis.lower.shape[0], 9.0)
     inputs = np.array([[0.0, 0.0, 0.9], [0.0, 0.0, -0.9]])
@@ -265,14 +269,14 @@ def test_chunks_are_told_of_the_observed_and_its_mirror_image(ended: bool) -> No
     kernel, basis, features = basis_of(data)
     dynamics, model = fitted(data, kernel)
     start = features[data.start].mean(axis=0)
-    regression = FeatureRegression(dynamics.predict, 0.0)
+    regression = FeatureRegression(dynamics.regression, 0.0)
     changes = FeatureChanges(basis, start, as_float)
-    own, expected = PredictedSuccessors(changes, dynamics.motion, regression, TASK)(data)
+    own, expected = PredictedSuccessors(changes, dynamics.delta_targets, regression, TASK)(data)
     np.testing.assert_allclose(own, features[data.state], atol=1e-8)
-    said = model.expected_features(dynamics.motion.targets(data, TASK))
-    said += dynamics.motion.trend(state_actions(data, TASK))
-    predicted = data.states + dynamics.motion.changes(said)
-    mirrored = basis.features(2.0 * predicted - data.points[data.successor])
+    said = model.expected_features(dynamics.delta_targets.targets(data, TASK))
+    said += dynamics.delta_targets.linear_mean(state_actions(data, TASK))
+    predict = data.states + dynamics.delta_targets.changes(said)
+    mirrored = basis.features(2.0 * predict - data.points[data.successor])
     spread = 0.5 * (features[data.successor] + mirrored)
     ends = np.clip(said[:, -1:], 0.0, 1.0)
     assert (ends.max() > 0.01) == ended
@@ -283,7 +287,7 @@ def test_rounding_is_not_learnt() -> None:
     still = 1.0 + 3e-16 * np.random.default_rng(0).integers(-1, 2, size=(4, 1))
     observations = np.column_stack([np.arange(4.0), still])
     data = Transitions.of([Rollout(observations, np.zeros((3, 1)), np.zeros(3))])
-    np.testing.assert_allclose(Motion.of(data, TASK).unit, [1.0, 1.0])
+    np.testing.assert_allclose(DeltaStateTargets.of(data, TASK).scale, [1.0, 1.0])
 
 
 def test_the_default_recipe_learns_of_it() -> None:

@@ -261,8 +261,8 @@ def test_few_pivots_say_what_all_samples_say(regulariser: float) -> None:
     exact = KernelEmbedding.fit(kernel, inputs, regulariser)
     few = PivotedEmbedding.fit(kernel, inputs, regulariser)
     assert few is not None and few.features.shape[1] < 100
-    missed = 1.0 - np.einsum("ij,ij->i", few.features, few.features)
-    assert missed.max() < 1.001 * embedding.NEGLIGIBLE * regulariser
+    loo_residuals = 1.0 - np.einsum("ij,ij->i", few.features, few.features)
+    assert loo_residuals.max() < 1.001 * embedding.NEGLIGIBLE * regulariser
     np.testing.assert_allclose(few.basis.features(inputs), few.features, atol=1e-8)
     elsewhere = rng.uniform(-1.0, 1.0, size=(50, 2))
     said, wanted = (model.predictor(targets)(elsewhere) for model in (few, exact))

@@ -27,15 +27,15 @@ from kreps.experiments.figures import (
     write_figure,
     write_results,
 )
-from kreps.experiments.runner import figure_cells, run_cells
+from kreps.experiments.runner import figure_trials, run_trials
 from kreps.experiments.specs import FIGURES, METHODS, TASKS
 from kreps.experiments.trials import (
-    Cell,
-    cell_of,
+    Trial,
     commits_of,
     name_of,
     read_cell,
     run_cell,
+    trial_of,
     write_cell,
 )
 from kreps.learning.learner import LEARNERS
@@ -43,9 +43,9 @@ from kreps.learning.learner import LEARNERS
 TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 
 
-def tiny(seed: int, method: str = "kernel REPS", **options: Any) -> Cell:
+def tiny(seed: int, method: str = "kernel REPS", **options: Any) -> Trial:
     """A cell that takes a moment."""
-    return cell_of("swing-up", method, seed, {**TINY, **options}, iterations=2, episodes=(3, 5))
+    return trial_of("swing-up", method, seed, {**TINY, **options}, iterations=2, episodes=(3, 5))
 
 
 class Inline(Executor):
@@ -66,7 +66,7 @@ class Inline(Executor):
 
 
 def test_cells_are_each_curve_with_each_seed_from_zero() -> None:
-    cells = figure_cells("swing-up", 3, None)
+    cells = figure_trials("swing-up", 3, None)
     methods = [method for _, method in FIGURES["swing-up"]]
     assert {"kreps (default)", "paper-like"} <= set(methods)
     assert [(c.method, c.seed) for c in cells] == [
@@ -82,14 +82,14 @@ def test_the_figures_show_what_the_paper_shows() -> None:
     assert "NPALP" in of["figure-1a"]
     assert "NPALP" not in of["figure-1b"]  # for deterministic tasks only
     assert len(of["figure-1a"]) == len(of["figure-1b"]) == 5
-    shared = {c.name for c in figure_cells("figure-1b", 2, None)}
-    assert shared & {c.name for c in figure_cells("figure-2b", 2, None)}  # run once, shown twice
+    shared = {c.name for c in figure_trials("figure-1b", 2, None)}
+    assert shared & {c.name for c in figure_trials("figure-2b", 2, None)}  # run once, shown twice
 
 
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_takes_its_options(task: str, method: str) -> None:
-    cell = cell_of(task, method, 0, {}, iterations=None, episodes=(2, 2))
+    cell = trial_of(task, method, 0, {}, iterations=None, episodes=(2, 2))
     LEARNERS[cell.learner](gym.make(cell.environment), seed=0, **cell.options)
 
 
@@ -108,15 +108,15 @@ def test_what_is_done_is_never_run_again(tmp_path: Path) -> None:
     cells = [tiny(seed, method) for seed in (0, 1) for method in ("kernel REPS", "NPALP")]
     broken = Inline(fail_at=2)
     with pytest.raises(CellFailure, match=r"1 of 4 cells failed, .*power"):
-        run_cells(cells, broken, tmp_path)
+        run_trials(cells, broken, tmp_path)
     done = [cell for cell in cells if read_cell(cell, tmp_path)]
     assert len(done) == len(cells) - 1
     rest = Inline()
-    results = run_cells([*cells, cells[0]], rest, tmp_path)
+    results = run_trials([*cells, cells[0]], rest, tmp_path)
     assert rest.calls == 1
     assert [name_of(r) for r in results] == [c.name for c in cells]
     idle = Inline()
-    assert run_cells(cells, idle, tmp_path) == results
+    assert run_trials(cells, idle, tmp_path) == results
     assert idle.calls == 0
 
 
@@ -144,7 +144,7 @@ def test_every_method_has_as_many_candidates_on_seeds_that_no_figure_uses() -> N
 
 
 def test_the_search_takes_the_candidate_of_the_best_mean(monkeypatch: pytest.MonkeyPatch) -> None:
-    cells = search.search_cells("reaching", "NPALP")
+    cells = search.search_trials("reaching", "NPALP")
     assert len({cell.name for of in cells for cell in of}) == len(cells) * len(search.SEEDS)
     rewards = np.random.default_rng(0).normal(size=(len(cells), len(search.SEEDS)))
     rewards[3] = (5.0, -1.0)
@@ -186,7 +186,9 @@ def test_the_candidates_mean_what_they_meant_in_the_committed_search() -> None:
         for method, candidates in methods.items():
             if METHODS[method].learner != "reps":
                 continue
-            for cells, candidate in zip(search.search_cells(task, method), candidates, strict=True):
+            for cells, candidate in zip(
+                search.search_trials(task, method), candidates, strict=True
+            ):
                 env = gym.make(cells[0].environment)
                 settings = vars(kreps.KREPS(env, **cells[0].options).settings)
                 paper = {"kl_bound": 0.5, "eta_floor": 0.02} if "recipe" in candidate else {}
@@ -321,14 +323,14 @@ def test_claims_are_written_from_result_files(tmp_path: Path) -> None:
 def test_a_dask_cluster_runs_the_same_cells(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     cells = [tiny(0), tiny(1)]
-    here = run_cells(cells, Inline(), tmp_path / "here")
+    here = run_trials(cells, Inline(), tmp_path / "here")
     with (
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, dashboard_address=None
         ) as cluster,
         executor(1, cluster.scheduler_address) as pool,
     ):
-        there = run_cells(cells, pool, tmp_path / "there")
+        there = run_trials(cells, pool, tmp_path / "there")
     for a, b in zip(here, there, strict=True):
         assert [r["greedy"] for r in a["rows"]] == [r["greedy"] for r in b["rows"]]
 
@@ -414,7 +416,7 @@ def test_a_figure_is_written_with_its_files(tmp_path: Path) -> None:
             ("kernel REPS", TINY),
             ("value iteration on a grid (simulator set to any state)", {"grid_states": 6}),
         ):
-            cell = cell_of("swing-up", method, seed, options, iterations=2, episodes=(2, 2))
+            cell = trial_of("swing-up", method, seed, options, iterations=2, episodes=(2, 2))
             results.append({"commit": "abc", **run_cell(cell)})
     paths = write_figure(tmp_path, "figure-1b", "a command", results)
     assert [path.suffix for path in paths] == [".csv", ".json", ".md", ".png"]
@@ -433,9 +435,9 @@ def test_cells_of_the_same_work_are_run_once(tmp_path: Path) -> None:
     cells = [tiny(0), tiny(0, same), tiny(1)]
     assert cells[0].work == cells[1].work != cells[2].work
     inline = Inline()
-    results = run_cells(cells[:2], inline, tmp_path)
+    results = run_trials(cells[:2], inline, tmp_path)
     assert inline.calls == 1
     assert [row["method"] for row in rows_of(results)] == ["kernel REPS"] * 2 + [same] * 2
     (tmp_path / f"{cells[0].name}.json").unlink()
-    assert run_cells(cells, inline, tmp_path)[:2] == results
+    assert run_trials(cells, inline, tmp_path)[:2] == results
     assert inline.calls == 2  # only the one that differs

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.data.rewards import each_tells, tells_alone, tells_of_states
+from kreps.data.rewards import all_rollouts_informative, is_informative, reward_depends_on_state
 from kreps.data.rollout import Rollout
 from kreps.data.task import TaskSpec
-from kreps.data.window import Window, extended, latest
+from kreps.data.window import ReplayWindow, append, newest
 from kreps.policies.exploration import PINK, RED, WHITE, coloured_noise
 
 TASK = TaskSpec(2, np.array([-2.0, -1.0]), np.array([2.0, 1.0]))
@@ -79,7 +79,7 @@ def rollout(reward: Any, seed: int = 0, steps: int = 30) -> Rollout:
     ],
 )
 def test_constants_and_prices_of_actions_tell_nothing(reward: Any) -> None:
-    assert not tells_of_states([rollout(reward, seed) for seed in range(3)], TASK)
+    assert not reward_depends_on_state([rollout(reward, seed) for seed in range(3)], TASK)
 
 
 @pytest.mark.parametrize(
@@ -93,22 +93,22 @@ def test_constants_and_prices_of_actions_tell_nothing(reward: Any) -> None:
     ],
 )
 def test_what_depends_on_states_tells(reward: Any) -> None:
-    assert tells_of_states([rollout(reward, seed) for seed in range(3)], TASK)
+    assert reward_depends_on_state([rollout(reward, seed) for seed in range(3)], TASK)
 
 
 def test_with_fewer_samples_than_terms_anything_but_a_constant_tells() -> None:
     def of(reward: Any) -> Rollout:
         return rollout(reward, steps=6)  # two actions have six terms
 
-    assert tells_of_states([of(lambda s, a: s[:, 0])], TASK)
-    assert not tells_of_states([of(lambda s, a: np.ones(len(s)))], TASK)
+    assert reward_depends_on_state([of(lambda s, a: s[:, 0])], TASK)
+    assert not reward_depends_on_state([of(lambda s, a: np.ones(len(s)))], TASK)
 
 
 @pytest.mark.parametrize("name", ["kreps/SwingUp-v0", "kreps/Reaching-v0", "Pendulum-v1"])
 def test_one_roll_out_of_a_dense_reward_tells(name: str) -> None:
     learner = kreps.KREPS(gym.make(name), initial_rollouts=1, rollouts_per_iteration=1)
     learner.learn(1, progress=False)
-    assert tells_of_states(learner.state.window.rollouts, learner.task)
+    assert reward_depends_on_state(learner.state.window.rollouts, learner.task)
 
 
 TINY: dict[str, Any] = {"initial_rollouts": 4, "rollouts_per_iteration": 2, "window": 4}
@@ -178,20 +178,20 @@ def of_rewards(rewards: list[Any], steps: int = 20) -> list[Rollout]:
 
 
 def test_one_roll_out_tells_if_it_is_long_enough() -> None:
-    assert tells_alone(rollout(GOAL, steps=7), TASK)  # two actions have six terms
-    assert not tells_alone(rollout(GOAL, steps=6), TASK)
-    assert not tells_alone(rollout(PRICE, steps=20), TASK)
+    assert is_informative(rollout(GOAL, steps=7), TASK)  # two actions have six terms
+    assert not is_informative(rollout(GOAL, steps=6), TASK)
+    assert not is_informative(rollout(PRICE, steps=20), TASK)
 
 
 def test_a_roll_out_that_tells_nothing_is_noticed_unless_it_is_too_short_to_know() -> None:
     telling = [rollout(GOAL, seed, steps=20) for seed in range(3)]
-    assert each_tells(telling, TASK)
-    assert not each_tells([*telling, rollout(PRICE, steps=20)], TASK)
+    assert all_rollouts_informative(telling, TASK)
+    assert not all_rollouts_informative([*telling, rollout(PRICE, steps=20)], TASK)
     for steps in (1, 6):
-        assert each_tells([*telling, rollout(PRICE, steps=steps)], TASK)
+        assert all_rollouts_informative([*telling, rollout(PRICE, steps=steps)], TASK)
     learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=0)
     learner.learn(1, progress=False)
-    assert each_tells(learner.state.window.rollouts, learner.task)
+    assert all_rollouts_informative(learner.state.window.rollouts, learner.task)
 
 
 @pytest.mark.parametrize(
@@ -210,8 +210,8 @@ def test_a_third_of_the_window_is_for_those_that_tell(
     before: int, goals: list[int], kept: list[int]
 ) -> None:
     seen = of_rewards([GOAL if i in goals else PRICE for i in range(10)])
-    window = Window(6, tuple(seen[:before]))
-    found = extended(window, seen[before:], TASK)
+    window = ReplayWindow(6, tuple(seen[:before]))
+    found = append(window, seen[before:], TASK)
     assert found.capacity == 6
     assert [next(i for i, r in enumerate(seen) if r is one) for one in found.rollouts] == kept
 
@@ -219,15 +219,15 @@ def test_a_third_of_the_window_is_for_those_that_tell(
 @pytest.mark.parametrize("capacity", [None, 20, 10])
 def test_what_there_is_room_for_is_kept(capacity: int | None) -> None:
     seen = of_rewards([PRICE, GOAL] * 5)
-    found = extended(Window(capacity, tuple(seen[:4])), seen[4:], TASK)
-    assert found == Window(capacity, tuple(seen))
+    found = append(ReplayWindow(capacity, tuple(seen[:4])), seen[4:], TASK)
+    assert found == ReplayWindow(capacity, tuple(seen))
 
 
 @pytest.mark.parametrize(("capacity", "count"), [(None, 10), (30, 10), (12, 8), (6, 4), (2, 2)])
 def test_the_latest_are_those_in_no_reserved_place(capacity: int | None, count: int) -> None:
     seen = of_rewards([PRICE] * 10)
-    window = extended(Window(capacity), seen, TASK)
-    assert tuple(latest(window)) == tuple(seen[-count:])
+    window = append(ReplayWindow(capacity), seen, TASK)
+    assert tuple(newest(window)) == tuple(seen[-count:])
 
 
 def test_it_explores_again_though_a_goal_is_remembered() -> None:

@@ -119,9 +119,9 @@ def test_the_policy_loss_equals_that_of_refits_without_each_sample(actions: int)
 @pytest.mark.parametrize("shift", [0.0, -1.0, 1.0])
 def test_the_gradient_of_the_policy_loss_of_means(actions: int, shift: float) -> None:
     loss, _, parameters = policy_case(25, 11, actions)
-    within = np.random.default_rng(12).exponential(0.5, 25)
+    target_variance = np.random.default_rng(12).exponential(0.5, 25)
     alone, gradient_alone = loss(parameters + shift)
-    loss = replace(loss, within=within)
+    loss = replace(loss, target_variance=target_variance)
     value, gradient = loss(parameters + shift)
     assert value > alone
     wanted = finite_differences(loss, parameters + shift)
@@ -139,8 +139,8 @@ def test_means_of_equal_states_have_the_expected_density_of_all_of_them(actions:
     weights = each.sum(axis=1)
     means = np.einsum("ij,ijk->ik", each, every) / weights[:, None]
     squares = np.sum((every - means[:, None]) ** 2, axis=2)
-    within = np.sum(each * squares, axis=1) / weights
-    of_means = PolicyLoss(loss.distances, means, weights, within)
+    target_variance = np.sum(each * squares, axis=1) / weights
+    of_means = PolicyLoss(loss.distances, means, weights, target_variance)
 
     kernel = Kernel(FACTORS, np.exp(parameters[:-2]))
     signal, noise = np.exp(parameters[-2:])

@@ -201,10 +201,10 @@ def rollouts_of_images(count: int, rng: np.random.Generator) -> list[Rollout]:
     for _ in range(count):
         actions = rng.uniform(-1.0, 1.0, size=(8, 1))
         steps = actions[:, 0] + 0.3 * rng.normal(size=8)
-        places = np.clip(np.concatenate([[2.5], 2.5 + np.cumsum(steps)]), 0.0, 5.0)
-        pictures = np.exp(-((places[:, None] - np.arange(6)) ** 2))
+        state_sources = np.clip(np.concatenate([[2.5], 2.5 + np.cumsum(steps)]), 0.0, 5.0)
+        pictures = np.exp(-((state_sources[:, None] - np.arange(6)) ** 2))
         observations = np.concatenate([pictures, np.diff(pictures, axis=0, prepend=0.0)], axis=1)
-        rollouts.append(Rollout(observations, actions, -((places[:-1] - 2.5) ** 2)))
+        rollouts.append(Rollout(observations, actions, -((state_sources[:-1] - 2.5) ** 2)))
     return rollouts
 
 

@@ -13,12 +13,12 @@ import pytest
 import kreps
 from kreps.algorithms import generated as imagined_step
 from kreps.algorithms import low_rank, reps
-from kreps.algorithms.dual import ETA_LEAST, DualProblem, effective_sample_size, standardise
-from kreps.algorithms.generated import ImaginedSamples, imagine
+from kreps.algorithms.dual import MIN_ETA, DualProblem, effective_sample_size, standardise
+from kreps.algorithms.generated import GeneratedSamples, generate
 from kreps.algorithms.reps import (
-    DROPPED_WEIGHT,
-    RIDGE_LEAST,
-    PolicySamples,
+    MIN_RELATIVE_WEIGHT,
+    MIN_RIDGE,
+    PolicyTargets,
     UpdateInfo,
     fit_policy,
     share_clipped,
@@ -35,9 +35,9 @@ from kreps.kernels.basis import Basis, RKHSBasis
 from kreps.kernels.hyperparameters import Prior, minimise
 from kreps.kernels.kernel import Kernel, SquaredExponential
 from kreps.kernels.regression import FeatureRegression, KernelEmbedding, LeaveOneOut, RegressionSums
-from kreps.kernels.sampling import resample
+from kreps.kernels.sampling import systematic_resampling
 from kreps.models import transition as transition_model
-from kreps.models.dynamics import Motion
+from kreps.models.dynamics import DeltaStateTargets
 from kreps.models.transition import (
     feature_differences,
     fit_embedding,
@@ -45,7 +45,7 @@ from kreps.models.transition import (
     state_actions,
     state_kernel,
 )
-from kreps.models.world_model import Outlook
+from kreps.models.world_model import WorldModel
 from kreps.policies import cost_sensitive_gp as policies
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.sparse_gp import PolicySums, SparseGP
@@ -54,7 +54,9 @@ from kreps.settings import Settings, settings_of
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
 
 
-def pushes(rollouts: int = 8, steps: int = 15, seed: int = 0, ended: bool = False) -> list[Rollout]:
+def pushes(
+    rollouts: int = 8, steps: int = 15, seed: int = 0, terminated: bool = False
+) -> list[Rollout]:
     """A mass with friction on a line, pushed at random, often beyond the limits."""
     rng = np.random.default_rng(seed)
     found = []
@@ -67,7 +69,7 @@ def pushes(rollouts: int = 8, steps: int = 15, seed: int = 0, ended: bool = Fals
         observations = np.array(states)
         rewards = -(observations[:-1, 0] ** 2) - 0.1 * observations[:-1, 1] ** 2
         rewards -= 0.01 * TASK.clip(actions)[:, 0] ** 2
-        found.append(Rollout(observations, actions, rewards, ended and number % 2 == 0))
+        found.append(Rollout(observations, actions, rewards, terminated and number % 2 == 0))
     return found
 
 
@@ -90,26 +92,30 @@ def test_states_are_drawn_as_often_as_their_weights_say(seed: int, count: int) -
     p = np.exp(3.0 * rng.normal(size=30))
     p[rng.uniform(size=30) < 0.3] = 0.0
     p /= p.sum()
-    rows = resample(p, count, rng)
+    rows = systematic_resampling(p, count, rng)
     assert len(rows) == count
     assert (np.diff(rows) >= 0).all()
-    counts = np.bincount(rows, minlength=30)
-    assert (counts >= np.floor(count * p - 1e-9)).all()
-    assert (counts <= np.ceil(count * p + 1e-9)).all()
-    assert not counts[p == 0.0].any()
+    split_budget = np.bincount(rows, minlength=30)
+    assert (split_budget >= np.floor(count * p - 1e-9)).all()
+    assert (split_budget <= np.ceil(count * p + 1e-9)).all()
+    assert not split_budget[p == 0.0].any()
 
 
 def test_the_draw_of_states_is_unbiased() -> None:
     rng = np.random.default_rng(0)
     p = np.array([0.5, 0.03, 0.17, 0.3])
-    counts = sum(np.bincount(resample(p, 7, rng), minlength=4) for _ in range(4000))
+    split_budget = sum(
+        np.bincount(systematic_resampling(p, 7, rng), minlength=4) for _ in range(4000)
+    )
     # each count is one of two neighbours: a standard deviation of at most one half
-    np.testing.assert_allclose(counts / 4000.0, 7.0 * p, atol=5 * 0.5 / np.sqrt(4000.0))
+    np.testing.assert_allclose(split_budget / 4000.0, 7.0 * p, atol=5 * 0.5 / np.sqrt(4000.0))
 
 
 def test_weights_need_not_add_up_to_one() -> None:
     p = np.array([0.1, 0.2, 0.3])
-    one, other = (resample(scale * p, 60, np.random.default_rng(1)) for scale in (1.0, 1e-3))
+    one, other = (
+        systematic_resampling(scale * p, 60, np.random.default_rng(1)) for scale in (1.0, 1e-3)
+    )
     np.testing.assert_array_equal(one, other)
     np.testing.assert_array_equal(np.bincount(one), [10, 20, 30])
 
@@ -146,7 +152,7 @@ class Case:
     def of(cls, **changes: Any) -> Case:
         rng = np.random.default_rng(5)
         settings = settings_of("default", **changes)
-        data = Transitions.of(pushes(ended=True))
+        data = Transitions.of(pushes(terminated=True))
         kernel = state_kernel(data, TASK, rng)
         basis, features = value_basis(data, kernel, settings)
         expectation = reps.expected_successors(
@@ -158,31 +164,31 @@ class Case:
         reward = regression.predictor(targets)
         return cls(data, settings, basis, features, rewards, expectation, reward)
 
-    def outlook(self, reward: Callable[[FloatArray], FloatArray] | None = None) -> Outlook:
-        assert self.expectation.of_actions is not None
-        return Outlook(
+    def world(self, reward: Callable[[FloatArray], FloatArray] | None = None) -> WorldModel:
+        assert self.expectation.for_actions is not None
+        return WorldModel(
             states=self.data.states,
             features=self.features[self.data.state],
-            features_at=self.basis.features,
+            phi=self.basis.features,
             restart=restart_features(
                 self.features[self.data.start].mean(axis=0),
                 self.features[self.data.state].mean(axis=0),
                 self.settings,
             ),
             rewards=self.rewards,
-            expect=self.expectation.of_actions,
+            expected_features_at=self.expectation.for_actions,
             reward=self.reward if reward is None else reward,
-            simulator=None,
-            optimism=None,
+            model_env=None,
+            bonus=None,
         )
 
-    def imagined(
+    def from_generated(
         self, policy: StochasticPolicy, weights: FloatArray | None = None, **changes: Any
-    ) -> ImaginedSamples:
+    ) -> GeneratedSamples:
         """With uniform weights, if none are given, and a ridge of 0.3."""
         n = len(self.data)
-        return imagine(
-            self.outlook(changes.pop("reward", None)),
+        return generate(
+            self.world(changes.pop("reward", None)),
             np.full(n, 1.0 / n) if weights is None else weights,
             policy,
             TASK,
@@ -196,15 +202,15 @@ class Case:
 def test_of_the_observed_actions_the_model_says_what_the_first_step_was_told(model: Any) -> None:
     case = Case.of(model=model)
     data = case.data
-    found = case.imagined(Given(data.actions), imagined=1)
+    found = case.from_generated(Given(data.actions), from_generated=1)
     np.testing.assert_array_equal(found.states[found.of], data.states)
     np.testing.assert_array_equal(found.actions, data.actions)
     p = case.settings.restart_probability
-    outlook = case.outlook()
-    wanted = feature_differences(outlook.features, case.expectation.expected, outlook.restart, p)
+    world = case.world()
+    wanted = feature_differences(world.features, case.expectation.expected, world.restart, p)
     assert np.abs(wanted).max() > 0.1
     np.testing.assert_allclose(found.problem.differences, wanted, atol=1e-8)
-    said = case.rewards.mean() + outlook.reward(state_actions(data, TASK))[:, 0]
+    said = case.rewards.mean() + world.reward(state_actions(data, TASK))[:, 0]
     said = np.clip(said, case.rewards.min(), case.rewards.max())
     np.testing.assert_allclose(found.problem.rewards, said - said.max(), atol=1e-8)
     assert np.corrcoef(said, case.rewards)[0, 1] > 0.9
@@ -214,26 +220,26 @@ def test_the_bounds_are_those_of_the_settings() -> None:
     case = Case.of(kl_bound=0.4, eta_floor=0.07)
     n = len(case.data)
     policy = Given(np.zeros((3 * n, 1)))
-    problem = case.imagined(policy, imagined=3).problem
+    problem = case.from_generated(policy, from_generated=3).problem
     assert (problem.kl_bound, problem.eta_floor) == (0.4, 0.07)
     assert problem.ridge == pytest.approx(0.3 / (3 * n), rel=1e-12)
-    assert case.imagined(policy, imagined=3, eta_floor=0.0).problem.eta_floor == ETA_LEAST
+    assert case.from_generated(policy, from_generated=3, eta_floor=0.0).problem.eta_floor == MIN_ETA
 
 
 def test_actions_are_drawn_in_the_states_of_the_weights() -> None:
-    case = Case.of(imagined=2)
+    case = Case.of(from_generated=2)
     n = len(case.data)
     weights = np.zeros(n)
     weights[[3, 11]] = 0.25, 0.75
     policy = Given(np.zeros((2 * n, 1)))
-    found = case.imagined(policy, weights)
+    found = case.from_generated(policy, weights)
     np.testing.assert_array_equal(found.states, case.data.states[[3, 11]])
     np.testing.assert_array_equal(np.bincount(found.of), [n // 2, 3 * n // 2])
     np.testing.assert_array_equal(policy.states, found.states[found.of])
 
 
 def test_the_model_is_asked_about_the_applied_actions_and_the_commanded_ones_are_kept() -> None:
-    case = Case.of(imagined=1)
+    case = Case.of(from_generated=1)
     n = len(case.data)
     commanded = np.linspace(-5.0, 5.0, n)[:, None]
     asked: list[FloatArray] = []
@@ -242,7 +248,7 @@ def test_the_model_is_asked_about_the_applied_actions_and_the_commanded_ones_are
         asked.append(inputs)
         return np.zeros((len(inputs), 1))
 
-    found = case.imagined(Given(commanded), reward=reward)
+    found = case.from_generated(Given(commanded), reward=reward)
     np.testing.assert_array_equal(found.actions, commanded)
     (inputs,) = asked
     np.testing.assert_array_equal(inputs[:, :2], case.data.states)
@@ -250,10 +256,12 @@ def test_the_model_is_asked_about_the_applied_actions_and_the_commanded_ones_are
 
 
 def test_no_reward_beyond_the_observed_ones_is_believed() -> None:
-    case = Case.of(imagined=1)
+    case = Case.of(from_generated=1)
     n = len(case.data)
     overshooting = np.linspace(-100.0, 100.0, n)
-    found = case.imagined(Given(np.zeros((n, 1))), reward=lambda inputs: overshooting[:, None])
+    found = case.from_generated(
+        Given(np.zeros((n, 1))), reward=lambda inputs: overshooting[:, None]
+    )
     rewards = found.problem.rewards
     assert rewards.max() == 0.0
     assert rewards.min() == pytest.approx(-np.ptp(case.rewards))
@@ -263,17 +271,17 @@ def test_no_reward_beyond_the_observed_ones_is_believed() -> None:
 
 @pytest.mark.parametrize("spread", [0.5, 3.0, 50.0])
 def test_predicted_rewards_stay_within_the_observed_range(spread: float) -> None:
-    case = Case.of(imagined=5)
+    case = Case.of(from_generated=5)
     actions = spread * np.random.default_rng(7).normal(size=(5 * len(case.data), 1))
-    rewards = case.imagined(Given(actions)).problem.rewards
+    rewards = case.from_generated(Given(actions)).problem.rewards
     assert rewards.max() == 0.0
     assert rewards.min() >= -np.ptp(case.rewards) - 1e-12
 
 
 def test_no_more_is_imagined_than_fits_in_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(imagined_step, "MOST_IMAGINED", 37)
-    case = Case.of(imagined=4)
-    found = case.imagined(Given(np.zeros((37, 1))))
+    monkeypatch.setattr(imagined_step, "MAX_GENERATED", 37)
+    case = Case.of(from_generated=4)
+    found = case.from_generated(Given(np.zeros((37, 1))))
     assert len(found.of) == len(found.actions) == len(found.problem.rewards) == 37
     assert found.problem.differences.shape == (37, case.features.shape[1])
     assert found.problem.ridge == pytest.approx(0.3 / 37)
@@ -316,12 +324,14 @@ def test_the_ridge_is_the_error_of_refits_without_each_sample(model: Any) -> Non
     if model == "change":
         errors = errors_of_refits(embedding, targets)
     else:
-        motion = Motion.of(data, TASK)
-        missed = errors_of_refits(embedding, motion.targets(data, TASK))
-        predicted = basis.features(data.points[data.successor] - motion.changes(missed))
+        delta_targets = DeltaStateTargets.of(data, TASK)
+        loo_residuals = errors_of_refits(embedding, delta_targets.targets(data, TASK))
+        predicted = basis.features(
+            data.points[data.successor] - delta_targets.changes(loo_residuals)
+        )
         errors = features[data.successor] - predicted
     assert info.ridge == pytest.approx(np.mean(np.sum(errors**2, axis=1)), rel=1e-6)
-    assert info.ridge > 5.0 * RIDGE_LEAST
+    assert info.ridge > 5.0 * MIN_RIDGE
     share = np.sqrt(np.sum(errors**2) / np.sum(targets**2))
     assert info.model_error == pytest.approx(share, rel=1e-6)
 
@@ -338,10 +348,10 @@ def test_a_ridge_that_is_given_is_taken() -> None:
 
 def test_a_model_without_error_leaves_some_ridge() -> None:
     errors = LeaveOneOut(np.ones((4, 2)), np.zeros((4, 2)))
-    assert stationarity_ridge(settings_of(), errors) == RIDGE_LEAST
+    assert stationarity_ridge(settings_of(), errors) == MIN_RIDGE
     still = [replace(r, observations=np.full_like(r.observations, 0.3)) for r in pushes(3)]
     learner, info = updated(still)
-    assert info.ridge == RIDGE_LEAST
+    assert info.ridge == MIN_RIDGE
     assert info.model_error == 0.0  # nothing was to be predicted
     assert np.isfinite(learner.policy.predict([0.3, 0.3], deterministic=True)[0]).all()
 
@@ -369,22 +379,22 @@ def test_targets_are_the_weighted_means_of_the_actions_of_each_state() -> None:
     p[::7] = 1e-9
     p /= p.sum()
     nothing = DualProblem(np.zeros(60), np.zeros((60, 1)), 1.0, 1.0, 1.0)
-    imagined = ImaginedSamples(data.states, rows, actions, nothing)
-    found = PolicySamples.imagined(imagined, p, task)
+    from_generated = GeneratedSamples(data.states, rows, actions, nothing)
+    found = PolicyTargets.from_generated(from_generated, p, task)
 
     scaled = (actions - [0.0, 5.0]) / [2.0, 5.0]
     w = p * effective_sample_size(p)
-    kept = 60 * p >= DROPPED_WEIGHT
+    kept = 60 * p >= MIN_RELATIVE_WEIGHT
     states = [i for i in np.unique(rows) if kept[rows == i].any()]
     assert rows[30] not in states and 10 < len(states) < len(np.unique(rows))
     np.testing.assert_array_equal(found.states, data.states[states])
-    for place, i in enumerate(states):
+    for to_device, i in enumerate(states):
         mine = kept & (rows == i)
         mean = np.average(scaled[mine], axis=0, weights=w[mine])
         spread = np.average((scaled[mine] - mean) ** 2, axis=0, weights=w[mine])
-        assert found.weights[place] == pytest.approx(w[mine].sum())
-        np.testing.assert_allclose(found.targets[place], mean, atol=1e-12)
-        assert found.within[place] == pytest.approx(spread.sum(), abs=1e-12)
+        assert found.weights[to_device] == pytest.approx(w[mine].sum())
+        np.testing.assert_allclose(found.targets[to_device], mean, atol=1e-12)
+        assert found.target_variance[to_device] == pytest.approx(spread.sum(), abs=1e-12)
     assert found.evidence == pytest.approx(w[kept].sum())
 
 
@@ -394,9 +404,9 @@ def test_of_one_action_in_each_state_nothing_is_lost() -> None:
     p /= p.sum()
     n = len(data)
     nothing = DualProblem(np.zeros(n), np.zeros((n, 1)), 1.0, 1.0, 1.0)
-    wanted = PolicySamples.of(data, p, TASK)
-    found = PolicySamples.imagined(
-        ImaginedSamples(data.states, np.arange(n), data.actions, nothing), p, TASK
+    wanted = PolicyTargets.of(data, p, TASK)
+    found = PolicyTargets.from_generated(
+        GeneratedSamples(data.states, np.arange(n), data.actions, nothing), p, TASK
     )
     for name, value in vars(wanted).items():
         np.testing.assert_allclose(getattr(found, name), value, atol=1e-14)
@@ -408,8 +418,10 @@ def test_the_spread_of_what_is_imagined_in_a_state_stays_in_the_policy() -> None
     states, means = rng.normal(size=(40, 2)), 0.1 * rng.normal(size=(40, 1))
     kernel = Kernel(TASK.state_factors, np.ones(2))
     noise = []
-    for within in (0.0, 0.5):
-        samples = PolicySamples(states, means, np.full(40, 4.0), 160.0, np.full(40, within))
+    for target_variance in (0.0, 0.5):
+        samples = PolicyTargets(
+            states, means, np.full(40, 4.0), 160.0, np.full(40, target_variance)
+        )
         x = reps.policy_hyperparameters(samples, kernel, settings_of(), None, rng)
         noise.append(float(np.exp(x[-1])))
     assert noise[1] == pytest.approx(0.5, rel=0.2)
@@ -440,7 +452,7 @@ def test_in_low_rank_it_comes_near_the_exact_update(
     for module in (embedding, policies):  # the exact one leaves out what noise hides
         monkeypatch.setattr(module, "NEGLIGIBLE", 1e-9)
     full: dict[str, Any] = {"basis_tolerance": 1e-9, "max_rank": 5000, "rank": 5000}
-    rollouts = pushes(ended=True)
+    rollouts = pushes(terminated=True)
     exact, wanted = updated(rollouts, approximation="exact", model=model, **full)
     found, info = updated(rollouts, approximation="pivoted", model=model, **full)
     assert info.rank == wanted.rank
@@ -477,12 +489,12 @@ def test_a_sample_says_what_it_would_say_if_all_samples_were_like_it(
     def every_fourth(numbers: IntArray, rng: np.random.Generator) -> IntArray:
         return numbers[: len(numbers) // copies]
 
-    outlooks: list[Outlook] = []
-    draw = low_rank.imagine
+    outlooks: list[WorldModel] = []
+    draw = low_rank.generate
 
-    def watch(outlook: Outlook, *others: Any) -> Any:
-        outlooks.append(outlook)
-        return draw(outlook, *others)
+    def watch(world: WorldModel, *others: Any) -> Any:
+        outlooks.append(world)
+        return draw(world, *others)
 
     monkeypatch.setattr(low_rank, "some", every_fourth)
     monkeypatch.setattr(low_rank, "imagine", watch)
@@ -512,7 +524,7 @@ def test_no_outlook_is_made_where_nothing_is_imagined(
     def never(*arguments: Any, **named: Any) -> None:
         raise AssertionError("an outlook")
 
-    monkeypatch.setattr(low_rank, "Outlook", never)
+    monkeypatch.setattr(low_rank, "WorldModel", never)
     _, info = updated(pushes(), approximation="pivoted", **settings)
     assert len(info.dual.weights) == info.samples
 
@@ -523,16 +535,16 @@ def test_each_step_begins_with_v_of_the_one_before_and_a_temperature_anew(
 ) -> None:
     module: Any = reps if approximation == "exact" else low_rank
     solved: list[tuple[Any, Any, Any]] = []
-    drawn: list[tuple[FloatArray, StochasticPolicy]] = []
-    solve, draw = module.solve_dual, module.imagine
+    sample: list[tuple[FloatArray, StochasticPolicy]] = []
+    solve, draw = module.solve_dual, module.generate
 
     def spy(problem: Any, start: Any = None) -> Any:
         solved.append((problem, start, solve(problem, start=start)))
         return solved[-1][2]
 
-    def watch(outlook: Outlook, weights: FloatArray, policy: Any, *others: Any) -> Any:
-        drawn.append((weights, policy))
-        return draw(outlook, weights, policy, *others)
+    def watch(world: WorldModel, weights: FloatArray, policy: Any, *others: Any) -> Any:
+        sample.append((weights, policy))
+        return draw(world, weights, policy, *others)
 
     monkeypatch.setattr(module, "solve_dual", spy)
     monkeypatch.setattr(module, "imagine", watch)
@@ -540,7 +552,7 @@ def test_each_step_begins_with_v_of_the_one_before_and_a_temperature_anew(
     (first, _, one), (second, start, two), (third, again, three) = solved
     assert start == (1.0, one.theta) and again == (1.0, two.theta)
     assert info.dual is three
-    (weights, policy), (same, better) = drawn
+    (weights, policy), (same, better) = sample
     np.testing.assert_allclose(weights, one.weights, rtol=1e-12)
     np.testing.assert_array_equal(same, weights)
     assert len({id(p) for p in (policy, better, learner.policy.process)}) == 3
@@ -574,7 +586,7 @@ def test_each_fit_of_the_policy_starts_from_the_one_before(
 
 
 def test_the_support_is_at_most_one_point_for_each_state() -> None:
-    learner, info = updated(pushes(), imagined=20, imagined_rollouts=0.0)
+    learner, info = updated(pushes(), from_generated=20, imagined_rollouts=0.0)
     assert len(info.dual.weights) == 20 * 120
     assert 30 < info.support <= 120
     assert info.support == len(learner.policy.process.states)
@@ -590,13 +602,13 @@ def test_the_spread_of_actions_within_a_state_is_unbiased() -> None:
     actions = 2.0 * rng.normal(0.0, 0.3, size=(n * each, 1)) + 5.0 * data.states[rows, :1]
     problem = DualProblem(np.zeros(n * each), np.zeros((n * each, 1)), 1.0, 1.0, 0.1)
     p = np.full(n * each, 1.0 / (n * each))
-    imagined = ImaginedSamples(data.states, rows, actions, problem)
-    samples = PolicySamples.imagined(imagined, p, TASK)
+    from_generated = GeneratedSamples(data.states, rows, actions, problem)
+    samples = PolicyTargets.from_generated(from_generated, p, TASK)
     assert samples.spread == pytest.approx(0.09, rel=0.05)  # in units of half the range
-    assert np.mean(samples.within) == pytest.approx(0.06, rel=0.05)
-    alone = ImaginedSamples(data.states, np.arange(n), actions[:n], problem)
-    assert PolicySamples.imagined(alone, p[:n], TASK).spread == np.inf
-    assert PolicySamples.of(data, p[:n], TASK).spread == np.inf
+    assert np.mean(samples.target_variance) == pytest.approx(0.06, rel=0.05)
+    alone = GeneratedSamples(data.states, np.arange(n), actions[:n], problem)
+    assert PolicyTargets.from_generated(alone, p[:n], TASK).spread == np.inf
+    assert PolicyTargets.of(data, p[:n], TASK).spread == np.inf
 
 
 def test_actions_are_drawn_with_no_more_noise_than_they_spread_within_a_state() -> None:
@@ -605,7 +617,7 @@ def test_actions_are_drawn_with_no_more_noise_than_they_spread_within_a_state() 
     kernel = Kernel((SquaredExponential((0,)), SquaredExponential((1,))), np.ones(2))
     x = np.log([1.0, 1.0, 0.8, 0.5])
     weights = rng.uniform(0.5, 1.0, size=40)
-    samples = PolicySamples(states, targets, weights, 30.0, np.zeros(40))
+    samples = PolicyTargets(states, targets, weights, 30.0, np.zeros(40))
     asked = 3.0 * rng.normal(size=(20, 2))
     fitted = fit_policy(samples, kernel, TASK, x)
     calm = fit_policy(replace(samples, spread=0.02), kernel, TASK, x)
@@ -621,7 +633,7 @@ def test_the_deviation_of_a_policy_can_be_less_and_its_mean_the_same() -> None:
     states, targets = rng.normal(size=(40, 2)), rng.normal(size=(40, 1))
     kernel = Kernel((SquaredExponential((0,)), SquaredExponential((1,))), np.ones(2))
     x = np.log([1.0, 1.0, 0.8, 0.5])
-    samples = PolicySamples(states, targets, rng.uniform(0.5, 1.0, size=40), 30.0, np.zeros(40))
+    samples = PolicyTargets(states, targets, rng.uniform(0.5, 1.0, size=40), 30.0, np.zeros(40))
     asked = 3.0 * rng.normal(size=(20, 2))
     basis, features = RKHSBasis.fit(kernel, states, tolerance=1e-6, max_rank=20)
     sums = PolicySums.of(features, samples.weights, targets)
@@ -630,7 +642,7 @@ def test_the_deviation_of_a_policy_can_be_less_and_its_mean_the_same() -> None:
         tuple(fit_policy(replace(samples, spread=s), kernel, TASK, x, n) for n in (1.0, 2.0))
         for s in (0.02, np.inf)
     ]
-    for wide, narrow in (*pairs, (sparse, sparse.narrowed(2.0))):
+    for wide, narrow in (*pairs, (sparse, sparse.deflated(2.0))):
         np.testing.assert_allclose(narrow.greedy(asked), wide.greedy(asked), atol=1e-9)
         np.testing.assert_allclose(
             narrow.standard_deviation(asked), 0.5 * wide.standard_deviation(asked), atol=1e-9
@@ -642,40 +654,40 @@ def test_actions_are_imagined_wider_and_then_taken_narrower(
     approximation: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module: Any = reps if approximation == "exact" else low_rank
-    drawn: list[FloatArray] = []
+    sample: list[FloatArray] = []
     spreads: list[float] = []
-    of_imagined = PolicySamples.imagined
+    of_imagined = PolicyTargets.from_generated
 
     def watch(
-        outlook: Outlook, weights: FloatArray, policy: StochasticPolicy, *others: Any
-    ) -> ImaginedSamples:
-        found = imagine(outlook, weights, policy, *others)
+        world: WorldModel, weights: FloatArray, policy: StochasticPolicy, *others: Any
+    ) -> GeneratedSamples:
+        found = generate(world, weights, policy, *others)
         states = found.states[found.of]
         mean = policy.act(states, np.zeros((len(states), 1)))
         deviation = policy.act(states, np.ones((len(states), 1))) - mean
-        drawn.append((found.actions - mean) / deviation)
+        sample.append((found.actions - mean) / deviation)
         return found
 
-    def samples(*arguments: Any) -> PolicySamples:
+    def samples(*arguments: Any) -> PolicyTargets:
         found = of_imagined(*arguments)
         spreads.append(found.spread)
         return found
 
     monkeypatch.setattr(module, "imagine", watch)
-    monkeypatch.setattr(PolicySamples, "imagined", samples)
+    monkeypatch.setattr(PolicyTargets, "imagined", samples)
     for wider in (1.0, 1.7):
         learner, info = updated(
-            pushes(), approximation=approximation, imagined=20, imagined_noise=wider
+            pushes(), approximation=approximation, from_generated=20, imagined_noise=wider
         )
         signal, fitted = info.policy_parameters[-2:]
         assert learner.policy.process.signal == pytest.approx(signal / wider**2)
         least, most = sorted(spreads[-2:])  # that of both places lies between theirs
         assert min(fitted, least) <= info.noise * wider**2 * (1.0 + 1e-9)
         assert info.noise * wider**2 <= min(fitted, most) * (1.0 + 1e-9)
-    for plain, wide in zip(drawn[:2], drawn[2:], strict=True):  # in either place
+    for plain, wide in zip(sample[:2], sample[2:], strict=True):  # in either place
         assert np.std(plain) == pytest.approx(1.0, rel=0.1)
         assert np.std(wide) == pytest.approx(1.7, rel=0.1)
-    np.testing.assert_allclose(drawn[2], 1.7 * drawn[0], atol=1e-6)
+    np.testing.assert_allclose(sample[2], 1.7 * sample[0], atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))

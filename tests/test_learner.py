@@ -71,8 +71,8 @@ def test_counts_are_exact_and_the_window_forgets(learnt: kreps.KREPS) -> None:
     assert (state.iteration, state.rollouts) == (2, 9)
     assert len(state.window.rollouts) == 6
     first = collected(learnt, BangBang(learnt.task), 0)
-    latest = sum(len(r) for r in state.window.rollouts[3:])
-    assert state.steps == sum(len(r) for r in first) + latest
+    newest = sum(len(r) for r in state.window.rollouts[3:])
+    assert state.steps == sum(len(r) for r in first) + newest
     for mine, theirs in zip(state.window.rollouts[:3], first[3:], strict=True):
         np.testing.assert_array_equal(mine.actions, theirs.actions)
 

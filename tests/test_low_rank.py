@@ -17,7 +17,12 @@ import kreps
 from kreps.algorithms import low_rank
 from kreps.algorithms.dual import DualProblem, DualSolution, Outcome, kl_from_uniform
 from kreps.algorithms.newton import GAP_TOLERANCE, KL_TOLERANCE, solve_dual
-from kreps.algorithms.reps import DROPPED_WEIGHT, PolicySamples, UpdateInfo, policy_hyperparameters
+from kreps.algorithms.reps import (
+    MIN_RELATIVE_WEIGHT,
+    PolicyTargets,
+    UpdateInfo,
+    policy_hyperparameters,
+)
 from kreps.algorithms.streaming import StreamedProblem
 from kreps.data import dataset as dataset_module
 from kreps.data.compute import Compute
@@ -348,16 +353,16 @@ def test_the_dual_of_all_samples_starts_from_the_solution_for_some(
 def test_the_prior_of_the_policy_is_weighed_against_all_samples(
     rollouts: list[Rollout], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen: list[PolicySamples] = []
+    seen: list[PolicyTargets] = []
 
-    def spy(samples: PolicySamples, *others: Any) -> FloatArray:
+    def spy(samples: PolicyTargets, *others: Any) -> FloatArray:
         seen.append(samples)
         return policy_hyperparameters(samples, *others)
 
     monkeypatch.setattr(low_rank, "policy_hyperparameters", spy)
     _, info = updated(rollouts, approximation="pivoted", **LOW)
     weights = info.dual.weights / np.sum(info.dual.weights**2)
-    kept = 345 * info.dual.weights >= DROPPED_WEIGHT
+    kept = 345 * info.dual.weights >= MIN_RELATIVE_WEIGHT
     assert kept.sum() > 200 == len(seen[0].weights)
     assert seen[0].evidence == pytest.approx(weights[kept].sum(), rel=1e-12)
 
@@ -389,7 +394,7 @@ def test_a_chunk_without_any_weight_says_nothing_of_the_policy(rollouts: list[Ro
     _, info = updated([*bad, *rollouts], approximation="pivoted", model="sample", **LOW)
     dataset = Dataset.of([*bad, *rollouts])
     first = dataset.split(info.dual.weights)[0]
-    assert len(first) * first.max() < DROPPED_WEIGHT
+    assert len(first) * first.max() < MIN_RELATIVE_WEIGHT
     assert info.dual.converged
 
 
@@ -501,15 +506,15 @@ def test_fits_start_where_those_of_the_last_update_ended(
 ) -> None:
     given: list[FloatArray | None] = []
 
-    def spy(function: Callable[..., Any], place: int) -> Callable[..., Any]:
+    def spy(function: Callable[..., Any], to_device: int) -> Callable[..., Any]:
         def spied(*arguments: Any) -> Any:
-            given.append(arguments[place])
+            given.append(arguments[to_device])
             return function(*arguments)
 
         return spied
 
-    for name, place in (("embedding_hyperparameters", 4), ("policy_hyperparameters", 3)):
-        monkeypatch.setattr(low_rank, name, spy(getattr(low_rank, name), place))
+    for name, to_device in (("embedding_hyperparameters", 4), ("policy_hyperparameters", 3)):
+        monkeypatch.setattr(low_rank, name, spy(getattr(low_rank, name), to_device))
     learner, _ = updated(rollouts, approximation="pivoted", **LOW)
     ends = [learner.state.embedding_start, learner.state.policy_start]
     learner.update(rollouts[:1])

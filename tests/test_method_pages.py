@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 
 from kreps.algorithms import npalp, reps, value_iteration
-from kreps.algorithms.generated import MOST_IMAGINED
+from kreps.algorithms.generated import MAX_GENERATED
 from kreps.experiments.search import CANDIDATES
 from kreps.experiments.specs import FIGURES, METHODS
 from kreps.kernels.kernel import IMAGE_BLUR
 from kreps.learning.learner import LEARNERS, IterationReport, Learner
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
-from kreps.settings import RECIPES, Settings
+from kreps.settings import PRESETS, Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs/methods"
@@ -219,9 +219,9 @@ def test_the_table_of_parameters_agrees_with_the_settings(page: Path) -> None:
         assert f'`{name}="{value}"`' in text
 
 
-@pytest.mark.parametrize("recipe", [name for name in RECIPES if name != "default"])
+@pytest.mark.parametrize("recipe", [name for name in PRESETS if name != "default"])
 def test_what_a_recipe_changes_is_said(recipe: str) -> None:
-    changed = {f.name for f in fields(Settings) if differ(RECIPES[recipe], Settings(), f.name)}
+    changed = {f.name for f in fields(Settings) if differ(PRESETS[recipe], Settings(), f.name)}
     (sentence,) = re.findall(
         rf'^`recipe="{recipe}"` changes (.+?);', KERNEL_PAGE, re.MULTILINE | re.DOTALL
     )
@@ -229,7 +229,7 @@ def test_what_a_recipe_changes_is_said(recipe: str) -> None:
 
 
 def test_how_the_default_departs_from_the_paper_recipe_is_said() -> None:
-    changed = {f.name for f in fields(Settings) if differ(RECIPES["paper"], Settings(), f.name)}
+    changed = {f.name for f in fields(Settings) if differ(PRESETS["paper"], Settings(), f.name)}
     deviations = (ROOT / "docs/deviations.md").read_text()
     listed = deviations.split("## What the default recipe changes")[1].split("\n## ")[0]
     items = re.findall(
@@ -241,7 +241,7 @@ def test_how_the_default_departs_from_the_paper_recipe_is_said() -> None:
     for name, default, paper in items:
         assert getattr(Settings(), name) == ast.literal_eval(default)
         if paper:
-            assert getattr(RECIPES["paper"], name) == ast.literal_eval(paper)
+            assert getattr(PRESETS["paper"], name) == ast.literal_eval(paper)
 
 
 def test_limits_are_those_of_the_code() -> None:
@@ -251,11 +251,11 @@ def test_limits_are_those_of_the_code() -> None:
     assert f"{npalp.MAX_IMPROVEMENTS} is the limit" in (FOLDER / "npalp.md").read_text()
     assert f"more than {MAX_SUPPORT} are refused" in KERNEL_PAGE
     assert f"smoothing of {IMAGE_BLUR:g} of their side" in KERNEL_PAGE
-    assert f"of them but at most {MOST_IMAGINED}" in KERNEL_PAGE
+    assert f"of them but at most {MAX_GENERATED}" in KERNEL_PAGE
     (least,) = re.findall(
         r"^   model's own error, .* and at least `(\S+)`:$", KERNEL_PAGE, re.MULTILINE
     )
-    assert float(least) == reps.RIDGE_LEAST
+    assert float(least) == reps.MIN_RIDGE
 
 
 # ---- metrics, and the example -----------------------------------------------------------------
@@ -306,7 +306,7 @@ def test_the_example_runs_and_reports_what_the_page_explains(
     if recipe is not None:
         protocol = {"exploration", "exploration_scale"}
         changed = {
-            f.name for f in fields(Settings) if differ(learner.settings, RECIPES[recipe], f.name)
+            f.name for f in fields(Settings) if differ(learner.settings, PRESETS[recipe], f.name)
         }
         assert changed <= options.keys() | tiny.keys() | protocol
     assert np.isfinite([float(word) for word in capsys.readouterr().out.split()]).all()

@@ -17,7 +17,7 @@ from kreps.algorithms.npalp import sample_bounds
 from kreps.algorithms.state import LearnerState
 from kreps.data.rollout import Rollout, Transitions
 from kreps.data.task import TaskSpec
-from kreps.data.window import Window
+from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray, IntArray
 from kreps.kernels.kernel import Kernel
 from kreps.policies.value_based import LipschitzPolicy
@@ -44,7 +44,7 @@ def rollouts_of(
 
 def learnt(rollouts: list[Rollout], **changes: float) -> LipschitzPolicy:
     chosen = NPALPSettings(**changes)  # type: ignore[arg-type]
-    state = LearnerState(Window(30))
+    state = LearnerState(ReplayWindow(30))
     new, _ = npalp.update(state, rollouts, TASK, chosen, np.random.default_rng(0))
     assert isinstance(new.policy, LipschitzPolicy)
     return new.policy

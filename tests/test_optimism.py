@@ -11,14 +11,21 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.algorithms.generated import imagine
+from kreps.algorithms.generated import generate
 from kreps.data.rollout import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Kernel
-from kreps.models.model_env import Followed
-from kreps.models.novelty import HIGHEST, KEPT, LEAST, Optimism, known_distance, optimism_of
-from kreps.models.world_model import Outlook
+from kreps.models.model_env import ModelRollouts
+from kreps.models.novelty import (
+    DECAY,
+    MAX_REWARD_SD,
+    MIN_STRENGTH,
+    NoveltyBonus,
+    novelty_bonus,
+    novelty_radius,
+)
+from kreps.models.world_model import WorldModel
 
 TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
 KERNEL = Kernel(TASK.state_factors, np.array([0.5, 2.0]))
@@ -32,7 +39,7 @@ def rollouts(count: int, seed: int = 0) -> list[Rollout]:
     ]
 
 
-def simulator(data: Transitions) -> Any:
+def model_env(data: Transitions) -> Any:
     return SimpleNamespace(data=data, kernel=KERNEL)
 
 
@@ -47,9 +54,9 @@ def test_nearly_all_samples_have_one_of_another_rollout_within_the_known_distanc
         for r in made
         for s in r.observations[:-1]
     ]
-    likeness = np.exp(-np.array(nearest))
-    found = known_distance(simulator(Transitions.of(made)))
-    assert found == pytest.approx(-np.log(np.quantile(likeness, 0.1)), rel=1e-9)
+    similarity = np.exp(-np.array(nearest))
+    found = novelty_radius(model_env(Transitions.of(made)))
+    assert found == pytest.approx(-np.log(np.quantile(similarity, 0.1)), rel=1e-9)
     assert np.mean(np.array(nearest) <= found) == pytest.approx(0.9, abs=0.03)
 
 
@@ -57,11 +64,11 @@ def test_samples_that_are_drawn_keep_their_rollouts() -> None:
     made = rollouts(40)
     whole = Transitions.of(made)
     chosen = np.arange(0, len(whole), 3)
-    drawn = whole.rows(chosen)
-    likeness = KERNEL.gram(drawn.states, drawn.states)
-    likeness[whole.rollout[chosen, None] == whole.rollout[chosen]] = 0.0
-    wanted = -np.log(np.quantile(likeness.max(axis=1), 0.1))
-    assert known_distance(simulator(drawn)) == pytest.approx(wanted, rel=1e-12)
+    sample = whole.rows(chosen)
+    similarity = KERNEL.gram(sample.states, sample.states)
+    similarity[whole.rollout[chosen, None] == whole.rollout[chosen]] = 0.0
+    wanted = -np.log(np.quantile(similarity.max(axis=1), 0.1))
+    assert novelty_radius(model_env(sample)) == pytest.approx(wanted, rel=1e-12)
     # the same roll-outs, drawn from chunk by chunk
     first = Transitions.of(made[:20])
     chunks = first, Transitions.of(made[20:])
@@ -70,29 +77,29 @@ def test_samples_that_are_drawn_keep_their_rollouts() -> None:
         for chunk, i in zip(chunks, (0, len(first)), strict=True)
     ]
     assert all(len(part) for part in parts)
-    assert known_distance(simulator(Transitions.joined(parts))) == pytest.approx(wanted, rel=1e-12)
-    assert known_distance(simulator(Transitions.joined(chunks))) == known_distance(simulator(whole))
+    assert novelty_radius(model_env(Transitions.concat(parts))) == pytest.approx(wanted, rel=1e-12)
+    assert novelty_radius(model_env(Transitions.concat(chunks))) == novelty_radius(model_env(whole))
 
 
 def test_in_panels_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    data = simulator(Transitions.of(rollouts(9)))
-    whole = known_distance(data)
-    monkeypatch.setattr("kreps.algorithms.optimism.AT_ONCE", 7)
-    assert known_distance(data) == pytest.approx(whole, rel=1e-9)
+    data = model_env(Transitions.of(rollouts(9)))
+    whole = novelty_radius(data)
+    monkeypatch.setattr("kreps.algorithms.optimism.BLOCK", 7)
+    assert novelty_radius(data) == pytest.approx(whole, rel=1e-9)
 
 
-def outlook_of(optimism: Optimism | None, simulator: Any) -> Outlook:
+def outlook_of(bonus: NoveltyBonus | None, model_env: Any) -> WorldModel:
     """Of two features, where the model says that nothing moves and nothing is earned."""
-    return Outlook(
+    return WorldModel(
         states=np.zeros((2, 2)),
         features=np.zeros((2, 2)),
-        features_at=lambda states: states,
+        phi=lambda states: states,
         restart=np.array([3.0, -1.0]),
         rewards=np.array([-3.0, 0.0]),
-        expect=lambda rows, inputs: inputs[:, :2],
+        expected_features_at=lambda rows, inputs: inputs[:, :2],
         reward=lambda given: np.zeros((len(given), 1)),
-        simulator=simulator,
-        optimism=optimism,
+        model_env=model_env,
+        bonus=bonus,
     )
 
 
@@ -103,10 +110,12 @@ def test_where_an_action_leads_is_unknown_but_not_beyond_a_real_end() -> None:
         dynamics=SimpleNamespace(predicted=lambda given: (given[:, :2] + 1.0, ends)),
         nearest=lambda states: (None, np.where((states == 2.0).all(axis=1), alike, np.nan)),
     )
-    outlook = outlook_of(Optimism(hoped=0.0, gain=-2.0, edge=0.5), process)
-    np.testing.assert_allclose(outlook.unknown_of(inputs), [0.0, 1.0, 0.0, 0.75])
-    for blind in (replace(outlook, simulator=None), replace(outlook, optimism=None)):
-        np.testing.assert_array_equal(blind.unknown_of(inputs), np.zeros(4))
+    world = outlook_of(
+        NoveltyBonus(optimistic_reward=0.0, average_reward_=-2.0, known_radius=0.5), process
+    )
+    np.testing.assert_allclose(world.novelty(inputs), [0.0, 1.0, 0.0, 0.75])
+    for blind in (replace(world, model_env=None), replace(world, bonus=None)):
+        np.testing.assert_array_equal(blind.novelty(inputs), np.zeros(4))
 
 
 def test_to_the_update_the_unknown_is_earned_at_once_and_followed_by_a_restart() -> None:
@@ -122,11 +131,11 @@ def test_to_the_update_the_unknown_is_earned_at_once_and_followed_by_a_restart()
         def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
             return np.zeros((len(states), 1))
 
-    settings = kreps.Settings(imagined=2, imagined_rollouts=0.0)
+    settings = kreps.Settings(from_generated=2, imagined_rollouts=0.0)
     weights = np.array([0.5, 0.5])
     sober, hopeful = (
-        imagine(
-            outlook_of(hope, Halfway()),
+        generate(
+            outlook_of(bonus, Halfway()),
             weights,
             Still(),
             TASK,
@@ -134,7 +143,10 @@ def test_to_the_update_the_unknown_is_earned_at_once_and_followed_by_a_restart()
             0.1,
             np.random.default_rng(0),
         ).problem
-        for hope in (None, Optimism(hoped=1.0, gain=-1.0, edge=0.5))
+        for bonus in (
+            None,
+            NoveltyBonus(optimistic_reward=1.0, average_reward_=-1.0, known_radius=0.5),
+        )
     )
     p = settings.restart_probability
     gained = hopeful.rewards - hopeful.rewards.min()
@@ -146,88 +158,92 @@ def test_to_the_update_the_unknown_is_earned_at_once_and_followed_by_a_restart()
 
 
 def test_one_rollout_says_nothing_of_what_is_known() -> None:
-    alone = simulator(Transitions.of(rollouts(1)))
-    assert known_distance(alone) is None
-    assert optimism_of(alone, np.arange(3.0), np.ones(3) / 3, 0, kreps.Settings()) is None
+    alone = model_env(Transitions.of(rollouts(1)))
+    assert novelty_radius(alone) is None
+    assert novelty_bonus(alone, np.arange(3.0), np.ones(3) / 3, 0, kreps.Settings()) is None
 
 
 def test_equal_states_leave_an_edge_above_zero() -> None:
     same = [Rollout(np.zeros((4, 2)), np.zeros((3, 1)), np.zeros(3))] * 3
-    found = known_distance(simulator(Transitions.of(same)))
+    found = novelty_radius(model_env(Transitions.of(same)))
     assert found is not None and found > 0.0
-    unknown = Optimism(1.0, 0.0, found).unknown(np.array([1.0, 0.99, 0.0]))
-    np.testing.assert_array_equal(unknown, [0.0, 1.0, 1.0])
+    novelty = NoveltyBonus(1.0, 0.0, found).novelty(np.array([1.0, 0.99, 0.0]))
+    np.testing.assert_array_equal(novelty, [0.0, 1.0, 1.0])
 
 
 def test_what_is_far_from_any_sample_is_unknown_and_what_is_near_is_not() -> None:
     far = np.array([[0.0, 0.5, 0.6, 1.0], [2.0, 50.0, 1e4, 0.4]])
-    found = Optimism(hoped=1.0, gain=0.0, edge=0.5).unknown(np.exp(-far))
+    found = NoveltyBonus(optimistic_reward=1.0, average_reward_=0.0, known_radius=0.5).novelty(
+        np.exp(-far)
+    )
     wanted = 1.0 - np.exp(-np.maximum(far - 0.5, 0.0) / 0.5)
     np.testing.assert_allclose(found, wanted, atol=1e-14)
     assert found[0, :2].tolist() == [0.0, 0.0] and found[1, 2] == 1.0
 
 
 def test_the_surplus_is_that_of_all_steps_until_the_restart() -> None:
-    hope = Optimism(hoped=-0.5, gain=-2.0, edge=0.5)
+    bonus = NoveltyBonus(optimistic_reward=-0.5, average_reward_=-2.0, known_radius=0.5)
     steps = 0.9 ** np.arange(1, 2000)  # beginning with the one after the action
-    assert hope.surplus(0.1) == pytest.approx(1.5 * steps.sum(), rel=1e-12)
+    assert bonus.exploration_bonus(0.1) == pytest.approx(1.5 * steps.sum(), rel=1e-12)
 
 
 def test_who_has_found_the_unknown_stays_there() -> None:
-    hope = Optimism(hoped=7.0, gain=0.0, edge=0.5)
-    known, unknown, half = 1.0, 0.0, np.exp(-0.5 * (1.0 + np.log(2.0)))
-    likeness = np.array([[known, known], [known, half], [unknown, known], [known, known]])
+    bonus = NoveltyBonus(optimistic_reward=7.0, average_reward_=0.0, known_radius=0.5)
+    known, novelty, half = 1.0, 0.0, np.exp(-0.5 * (1.0 + np.log(2.0)))
+    similarity = np.array([[known, known], [known, half], [novelty, known], [known, known]])
     rewards = np.arange(8.0).reshape(4, 2)
     never = np.zeros((4, 2), dtype=bool)
-    found = hope.hoped_rewards(Followed(rewards, likeness, never))
+    found = bonus.optimistic_rewards(ModelRollouts(rewards, similarity, never))
     still = (7.0 + 7.0) / 2
     wanted = [[0.0, 1.0], [2.0, (3.0 + 7.0) / 2], [7.0, (5.0 + 7.0) / 2], [7.0, still]]
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
     # after a real end it begins anew
-    ended = never.copy()
-    ended[2] = True
-    found = hope.hoped_rewards(Followed(rewards, likeness, ended))
+    terminated = never.copy()
+    terminated[2] = True
+    found = bonus.optimistic_rewards(ModelRollouts(rewards, similarity, terminated))
     np.testing.assert_allclose(found, [*wanted[:3], [6.0, 7.0]], rtol=1e-12)
 
 
 def test_optimism_falls_at_each_update_and_ends() -> None:
-    data = simulator(Transitions.of(rollouts(5)))
-    settings = kreps.Settings(optimism=0.5)
+    data = model_env(Transitions.of(rollouts(5)))
+    settings = kreps.Settings(bonus=0.5)
     rewards, weights = np.arange(9.0), np.eye(9)[2]
-    hoped = []
-    while (hope := optimism_of(data, rewards, weights, len(hoped), settings)) is not None:
-        assert hope.gain == 2.0
-        hoped.append(hope.hoped)
+    optimistic_reward = []
+    while (
+        bonus := novelty_bonus(data, rewards, weights, len(optimistic_reward), settings)
+    ) is not None:
+        assert bonus.average_reward_ == 2.0
+        optimistic_reward.append(bonus.optimistic_reward)
     best = rewards.max()
-    strengths = (np.array(hoped) - 2.0) / (best - 2.0)
-    np.testing.assert_allclose(strengths, 0.5 * KEPT ** np.arange(len(hoped)))
-    assert strengths[-1] >= LEAST > KEPT * strengths[-1]
-    assert optimism_of(None, rewards, weights, 0, settings) is None
-    assert optimism_of(data, rewards, weights, 0, replace(settings, optimism=0.0)) is None
+    strengths = (np.array(optimistic_reward) - 2.0) / (best - 2.0)
+    np.testing.assert_allclose(strengths, 0.5 * DECAY ** np.arange(len(optimistic_reward)))
+    assert strengths[-1] >= MIN_STRENGTH > DECAY * strengths[-1]
+    assert novelty_bonus(None, rewards, weights, 0, settings) is None
+    assert novelty_bonus(data, rewards, weights, 0, replace(settings, bonus=0.0)) is None
 
 
 def test_who_earns_the_best_hopes_for_no_less() -> None:
-    data = simulator(Transitions.of(rollouts(5)))
+    data = model_env(Transitions.of(rollouts(5)))
     rewards, weights = np.array([0.0] * 99 + [100.0]), np.eye(100)[-1]
-    hope = optimism_of(data, rewards, weights, 0, kreps.Settings())
-    assert hope is not None and hope.hoped == hope.gain == 100.0
+    bonus = novelty_bonus(data, rewards, weights, 0, kreps.Settings())
+    assert bonus is not None and bonus.optimistic_reward == bonus.average_reward_ == 100.0
 
 
 def test_a_seldom_goal_is_not_hoped_for_everywhere() -> None:
-    data = simulator(Transitions.of(rollouts(5)))
+    data = model_env(Transitions.of(rollouts(5)))
     often, seldom = np.array([0.0, 1.0] * 50), np.array([0.0] * 99 + [100.0])
-    settings, weights = kreps.Settings(optimism=1.0), np.full(100, 0.01)
-    hopes = [optimism_of(data, rewards, weights, 0, settings) for rewards in (often, seldom)]
-    assert [hope.hoped for hope in hopes if hope is not None] == [
+    settings, weights = kreps.Settings(bonus=1.0), np.full(100, 0.01)
+    hopes = [novelty_bonus(data, rewards, weights, 0, settings) for rewards in (often, seldom)]
+    assert [bonus.optimistic_reward for bonus in hopes if bonus is not None] == [
         1.0,
-        pytest.approx(seldom.mean() + HIGHEST * seldom.std()),
+        pytest.approx(seldom.mean() + MAX_REWARD_SD * seldom.std()),
     ]
 
 
-def visited_height(optimism: float) -> float:
+def visited_height(bonus: float) -> float:
     """The angle from the top that an eighth of the second batch's states are within."""
     learner = kreps.KREPS(
-        gym.make("kreps/SwingUp-v0"), seed=248, exploration="gaussian", optimism=optimism
+        gym.make("kreps/SwingUp-v0"), seed=248, exploration="gaussian", bonus=bonus
     )
     learner.learn(2, progress=False)
     newest = learner.state.window.rollouts[-10:]
@@ -238,4 +254,4 @@ def visited_height(optimism: float) -> float:
 def test_an_optimist_goes_where_it_has_not_been() -> None:
     # white noise showed nothing of the height, and what was learnt of that holds the lean
     assert visited_height(0.0) > 1.6
-    assert visited_height(kreps.Settings().optimism) < 1.4
+    assert visited_height(kreps.Settings().bonus) < 1.4

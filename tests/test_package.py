@@ -58,7 +58,7 @@ def test_every_public_name_exists_and_is_documented() -> None:
     assert set(kreps.__all__) <= set(dir(kreps))
     for name in kreps.__all__:
         thing = getattr(kreps, name)
-        assert name == "RECIPES" or thing.__doc__
+        assert name == "PRESETS" or thing.__doc__
     with pytest.raises(AttributeError, match="Nothing"):
         _ = kreps.Nothing
 

@@ -10,20 +10,20 @@ import pytest
 import scipy.optimize
 
 from kreps.algorithms import reps
-from kreps.algorithms.acceptance import ETA_FLOOR_NOT_JUDGED
+from kreps.algorithms.acceptance import ETA_FLOOR_WITHOUT_ACCEPTANCE_TEST
 from kreps.algorithms.dual import DualProblem, Outcome, kl_from_uniform
 from kreps.algorithms.newton import KL_TOLERANCE, solve_dual
 from kreps.algorithms.reps import (
-    DROPPED_WEIGHT,
+    MIN_RELATIVE_WEIGHT,
     LearnerState,
-    PolicySamples,
+    PolicyTargets,
     UpdateInfo,
     policy_hyperparameters,
     update,
 )
 from kreps.data.rollout import Rollout, Transitions
 from kreps.data.task import TaskSpec
-from kreps.data.window import Window
+from kreps.data.window import ReplayWindow
 from kreps.errors import DataError
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.hyperparameters import TOLERANCE, PolicyLoss, Prior, factor_distances, minimise
@@ -33,7 +33,7 @@ from kreps.models.transition import feature_differences, restart_features, succe
 from kreps.settings import Settings, settings_of
 
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
-OBSERVED = settings_of("observed")
+SINGLE_STEP = settings_of("observed")
 """One step on the actions that were taken: what most of these tests are about."""
 
 
@@ -61,7 +61,7 @@ def collect(
 
 
 def fresh(capacity: int = 30) -> LearnerState:
-    return LearnerState(Window(capacity))
+    return LearnerState(ReplayWindow(capacity))
 
 
 def run(
@@ -75,7 +75,7 @@ def run(
         fresh() if state is None else state,
         rollouts,
         task,
-        OBSERVED if settings is None else settings,
+        SINGLE_STEP if settings is None else settings,
         np.random.default_rng(seed),
     )
 
@@ -109,9 +109,13 @@ def assert_bounded(info: UpdateInfo, settings: Settings) -> None:
     """KL is at its bound, or below it with the temperature at its floor."""
     dual = info.dual
     assert dual.converged
-    drawn = max(settings.imagined, 1) * info.samples
-    led = round(settings.imagined_rollouts * drawn)  # these come last, where states can be led to
-    assert len(dual.weights) in ((drawn, led) if settings.imagined else (drawn,))
+    sample = max(settings.from_generated, 1) * info.samples
+    from_model_rollouts = round(
+        settings.imagined_rollouts * sample
+    )  # these come last, where states can be led to
+    assert len(dual.weights) in (
+        (sample, from_model_rollouts) if settings.from_generated else (sample,)
+    )
     assert dual.weights.sum() == pytest.approx(1.0, abs=1e-12)
     assert (dual.weights >= 0.0).all()
     kl = kl_from_uniform(dual.weights)
@@ -202,7 +206,7 @@ def test_the_policy_is_the_weighted_process_of_the_commanded_actions() -> None:
     state, info = run(rollouts)
     assert state.policy is not None
     p = info.dual.weights
-    kept = 150 * p >= DROPPED_WEIGHT
+    kept = 150 * p >= MIN_RELATIVE_WEIGHT
     assert 0 < kept.sum() < 150
     assert info.support == kept.sum()
     weights = p[kept] / np.sum(p**2)
@@ -248,7 +252,7 @@ def test_policy_hyperparameters_are_the_most_probable_ones() -> None:
     rng = np.random.default_rng(13)
     states, targets = rng.normal(size=(25, 2)), rng.normal(0.0, 0.8, size=(25, 1))
     weights = rng.uniform(0.2, 2.0, 25)
-    samples = PolicySamples(states, targets, weights, float(weights.sum()), np.zeros(25))
+    samples = PolicyTargets(states, targets, weights, float(weights.sum()), np.zeros(25))
     kernel = Kernel(factors_of(2), np.array([0.9, 1.4]))
     found = policy_hyperparameters(samples, kernel, settings_of(), None, rng)
 
@@ -275,7 +279,7 @@ def test_bounded_policy_hyperparameters_keep_to_their_ranges() -> None:
     high = np.log([0.9, 1.4, 3.0, 4.0])
     # Pure noise asks for a long lengthscale, targets all zero for no variance.
     for targets in (rng.normal(size=(40, 1)), np.zeros((40, 1)), 100.0 * states[:, :1]):
-        samples = PolicySamples(states, targets, np.ones(40), 40.0, np.zeros(40))
+        samples = PolicyTargets(states, targets, np.ones(40), 40.0, np.zeros(40))
         found = policy_hyperparameters(samples, kernel, settings_of("paper"), None, rng)
         assert (found >= low - 1e-12).all()
         assert (found <= high + 1e-12).all()
@@ -373,9 +377,9 @@ def test_a_constant_added_to_the_reward_changes_nothing() -> None:
 def test_equal_rewards_are_learnt_from_without_harm(recipe: str) -> None:
     settings = settings_of(recipe)
     state, info = run(with_rewards(collect(), lambda r: np.full_like(r, -3.0)), settings)
-    assert_bounded(info, replace(settings, imagined=0))  # there is nothing to gain by it
+    assert_bounded(info, replace(settings, from_generated=0))  # there is nothing to gain by it
     if recipe == "default":  # and nothing is judged, so the step is as careful as where it cannot
-        assert (info.refused, info.eta_floor) == (None, ETA_FLOOR_NOT_JUDGED)
+        assert (info.rejected, info.eta_floor) == (None, ETA_FLOOR_WITHOUT_ACCEPTANCE_TEST)
     assert_usable(state)
 
 
@@ -424,7 +428,7 @@ def test_a_single_distinct_action_is_served(recipe: str) -> None:
     settings = replace(hopeful, optimism=0.0)  # no other action is hoped for
     state, info = run(same, settings)
     assert state.policy is not None
-    if settings.imagined:
+    if settings.from_generated:
         weights = state.policy.weights / state.policy.weights.sum()
         near = state.policy.states[weights > 0.01]
     else:
@@ -452,7 +456,7 @@ def test_rewards_with_one_enormous_outlier_are_served(recipe: str) -> None:
     settings = settings_of(recipe)
     state, info = run(rollouts, settings)
     assert_bounded(info, settings)
-    if not settings.imagined:
+    if not settings.from_generated:
         assert info.dual.weights[3] < 1e-6
     assert_usable(state)
 
@@ -548,8 +552,8 @@ def test_exploring_starts_give_weight_to_the_best_action_beside_the_way() -> Non
         assert p[stay] > 0.9
         assert p[leave] < 1e-3
     assert found[0.0][[back, remain]].sum() < 1e-4
-    beside = 0.1 * 0.25 * 0.5  # restarts there, and it is left at once
-    assert found[0.25][back] == pytest.approx(beside, rel=0.1)
+    concat = 0.1 * 0.25 * 0.5  # restarts there, and it is left at once
+    assert found[0.25][back] == pytest.approx(concat, rel=0.1)
     assert found[0.25][remain] < 0.1 * found[0.25][back]
 
 
@@ -560,7 +564,7 @@ def test_policy_samples_drop_what_weighs_next_to_nothing() -> None:
     p = np.full(n, 1.0)
     p[[1, 4]] = 1e-4
     p /= p.sum()
-    found = PolicySamples.of(data, p, task)
+    found = PolicyTargets.of(data, p, task)
     kept = np.setdiff1d(np.arange(n), [1, 4])
     np.testing.assert_array_equal(found.states, data.states[kept])
     np.testing.assert_allclose(found.targets, (data.actions[kept] - 3.0) / 2.0)

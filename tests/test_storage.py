@@ -62,7 +62,7 @@ def load(kind: str, path: Path, method: str = "reps") -> Any:
     return kreps.load_policy(path) if kind == "policy" else LEARNERS[method].resume(path)
 
 
-def refused(kind: str, path: Path, method: str = "reps") -> str:
+def rejected(kind: str, path: Path, method: str = "reps") -> str:
     """The message with which a file is refused: quickly, and naming the file."""
     started = time.process_time()
     with pytest.raises(StorageError) as caught:
@@ -111,16 +111,16 @@ class Good:
     def load(self, path: Path) -> Any:
         return load(self.kind, path, self.method)
 
-    def refused(self, path: Path) -> str:
-        return refused(self.kind, path, self.method)
+    def rejected(self, path: Path) -> str:
+        return rejected(self.kind, path, self.method)
 
     def refused_with(
         self, path: Path, tensors: dict[str, Any] | None = None, header: Any = None
     ) -> str:
-        """As `refused`, with other arrays or another header."""
+        """As `rejected`, with other arrays or another header."""
         arrays, known = parts(self.content)
         forge(path, arrays if tensors is None else tensors, known if header is None else header)
-        return self.refused(path)
+        return self.rejected(path)
 
 
 def compressed(learner: Learner[Any], centres: int) -> Learner[Any]:
@@ -530,13 +530,13 @@ def test_a_truncated_file_is_refused_at_every_length(good: Good, tmp_path: Path)
     lengths = {*range(0, 17, 4), *np.linspace(17, len(content) - 1, 30).astype(int).tolist()}
     for length in sorted(lengths):
         path.write_bytes(content[:length])
-        good.refused(path)
+        good.rejected(path)
 
 
 def test_an_overlong_file_is_refused(good: Good, tmp_path: Path) -> None:
     path = tmp_path / "long"
     path.write_bytes(good.content + b"\0" * 8)
-    good.refused(path)
+    good.rejected(path)
 
 
 def test_flipped_bytes_are_refused_or_harmless(good: Good, tmp_path: Path) -> None:
@@ -587,7 +587,7 @@ def assert_finite(loaded: Any, what: str) -> None:
 def test_foreign_files_are_refused(kind: str, content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "foreign"
     path.write_bytes(content)
-    refused(kind, path)
+    rejected(kind, path)
 
 
 def test_a_pickle_is_not_executed(tmp_path: Path) -> None:
@@ -598,41 +598,41 @@ def test_a_pickle_is_not_executed(tmp_path: Path) -> None:
     path = tmp_path / "bomb"
     path.write_bytes(pickle.dumps(Bomb()))
     for kind in KINDS:
-        refused(kind, path)
+        rejected(kind, path)
     assert not (tmp_path / "exploded").exists()
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_paths_that_are_no_files_are_refused(kind: str, tmp_path: Path) -> None:
-    refused(kind, tmp_path)
-    refused(kind, tmp_path / "missing")
+    rejected(kind, tmp_path)
+    rejected(kind, tmp_path / "missing")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
-    refused(kind, tmp_path / "loop")
+    rejected(kind, tmp_path / "loop")
     os.mkfifo(tmp_path / "pipe")  # opening it would wait for a writer for ever
-    refused(kind, tmp_path / "pipe")
-    refused(kind, tmp_path / ("x" * 300))
+    rejected(kind, tmp_path / "pipe")
+    rejected(kind, tmp_path / ("x" * 300))
 
 
 def test_other_safetensors_files_are_refused(good: Good, tmp_path: Path) -> None:
     path = tmp_path / "foreign"
     path.write_bytes(safetensors.numpy.save(good.tensors))
-    assert "another program" in good.refused(path)
+    assert "another program" in good.rejected(path)
     forge(path, good.tensors, good.header, key="other")
-    assert "another program" in good.refused(path)
+    assert "another program" in good.rejected(path)
 
 
 def test_a_checkpoint_is_no_policy_and_the_other_way_round(good: Good, tmp_path: Path) -> None:
     path = tmp_path / "x"
     path.write_bytes(good.content)
     (other,) = {*KINDS} - {good.kind}
-    assert f"it is a kreps {good.kind}" in refused(other, path, good.method)
+    assert f"it is a kreps {good.kind}" in rejected(other, path, good.method)
 
 
 def test_a_checkpoint_is_only_for_its_method(checkpoint: Good, tmp_path: Path) -> None:
     path = tmp_path / "x"
     path.write_bytes(checkpoint.content)
     for method in LEARNERS.keys() - {checkpoint.method}:
-        assert f"method {checkpoint.method}" in refused("checkpoint", path, method)
+        assert f"method {checkpoint.method}" in rejected("checkpoint", path, method)
     for method in (None, [], {}, 7, "", checkpoint.method.upper()):
         header = {**checkpoint.header, "method": method}
         assert "method" in checkpoint.refused_with(path, header=header)
@@ -667,8 +667,10 @@ def test_every_array_is_needed_in_its_shape(good: Good, tmp_path: Path) -> None:
         assert name in good.refused_with(path, others)
         if name not in OPTIONAL:
             # without its cuts, V has one lengthscale too many
-            missed = "value.lengthscales" if name == "value.cuts" else name
-            assert missed in good.refused_with(path, others, {**header, "arrays": sorted(others)})
+            loo_residuals = "value.lengthscales" if name == "value.cuts" else name
+            assert loo_residuals in good.refused_with(
+                path, others, {**header, "arrays": sorted(others)}
+            )
         wide = np.concatenate([values, values], axis=-1)
         for wrong in (wide, values[:-1], values[None], values.ravel()[:0], np.float64(1.0)):
             if np.atleast_1d(wrong).shape == values.shape:  # so it is written
@@ -994,7 +996,7 @@ def test_forged_headers_are_refused(text: str, files: dict[str, Good], tmp_path:
 def test_deeply_nested_json_is_refused(files: dict[str, Good], tmp_path: Path) -> None:
     nested = '{"kind": "policy", "version": 2, "task": ' + '{"a":' * 40_000 + "1" + "}" * 40_001
     files["reps policy"].refused_with(tmp_path / "x", header=nested)
-    refused("policy", raw(tmp_path / "y", b'{"a":' * 30_000 + b"1" + b"}" * 30_000))
+    rejected("policy", raw(tmp_path / "y", b'{"a":' * 30_000 + b"1" + b"}" * 30_000))
 
 
 @pytest.mark.parametrize("declared", [0, 1, 2**18, 2**31, 2**40, 2**63 - 1, 2**63, 2**64 - 1])
@@ -1004,7 +1006,7 @@ def test_a_wrong_header_length_is_refused_without_an_allocation(
     path = raw(tmp_path / "x", b'{"__metadata__":{}}', declared)
     tracemalloc.start()
     try:
-        refused("policy", path)
+        rejected("policy", path)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
@@ -1027,14 +1029,14 @@ def test_arrays_that_lie_about_their_place_are_refused(
 ) -> None:
     metadata = {"kreps": json.dumps({"kind": "policy", "version": 2, "task": _task()})}
     header = json.dumps({"__metadata__": metadata, "policy.weights": entry}).encode()
-    refused("policy", raw(tmp_path / "x", header, body=b"\0" * 8))
+    rejected("policy", raw(tmp_path / "x", header, body=b"\0" * 8))
 
 
 def test_a_file_of_three_gibibytes_is_refused_at_once(good: Good, tmp_path: Path) -> None:
     path = tmp_path / "sparse"
     path.write_bytes(good.content)
     os.truncate(path, 3 * 2**30)
-    assert "limit" in good.refused(path)
+    assert "limit" in good.rejected(path)
 
 
 def test_too_many_support_points_are_refused_at_once(tmp_path: Path) -> None:
@@ -1043,7 +1045,7 @@ def test_too_many_support_points_are_refused_at_once(tmp_path: Path) -> None:
     tracemalloc.start()
     started = time.process_time()
     try:
-        assert str(MAX_SUPPORT) in refused("policy", path).replace(",", "").replace("_", "")
+        assert str(MAX_SUPPORT) in rejected("policy", path).replace(",", "").replace("_", "")
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()

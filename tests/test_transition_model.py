@@ -9,7 +9,12 @@ from kreps.data.rollout import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.hyperparameters import EmbeddingLoss, Prior
-from kreps.kernels.sampling import FIT_SAMPLE, evidence, inclusion, telling_rows
+from kreps.kernels.sampling import (
+    FIT_SAMPLE,
+    effective_target_count,
+    inclusion_probabilities,
+    pps_subsample,
+)
 from kreps.models import transition as transition_model
 from kreps.models.transition import (
     embedding_hyperparameters,
@@ -26,7 +31,7 @@ def heavy_tailed(n: int = 1500) -> FloatArray:
 
 
 def test_few_rows_are_all_taken() -> None:
-    rows, weights = telling_rows(heavy_tailed(FIT_SAMPLE), np.random.default_rng(0))
+    rows, weights = pps_subsample(heavy_tailed(FIT_SAMPLE), np.random.default_rng(0))
     np.testing.assert_array_equal(rows, np.arange(FIT_SAMPLE))
     np.testing.assert_array_equal(weights, 1.0)
 
@@ -36,7 +41,7 @@ def test_sums_over_the_rows_are_those_of_all_on_average(squares: FloatArray) -> 
     summed = np.cos(np.arange(len(squares))) ** 2 + squares
     found = []
     for seed in range(400):
-        rows, weights = telling_rows(squares, np.random.default_rng(seed))
+        rows, weights = pps_subsample(squares, np.random.default_rng(seed))
         assert len(np.unique(rows)) == len(rows) and abs(len(rows) - FIT_SAMPLE) <= 1
         found.append(weights @ summed[rows])
     error = np.std(found) / np.sqrt(len(found))
@@ -48,7 +53,7 @@ def test_rare_rows_are_never_missed() -> None:
     rare = np.array([3, 700, 1499])
     squares[rare] = 100.0
     for seed in range(20):
-        rows, weights = telling_rows(squares, np.random.default_rng(seed))
+        rows, weights = pps_subsample(squares, np.random.default_rng(seed))
         assert np.isin(rare, rows).all()
         np.testing.assert_array_equal(weights[np.isin(rows, rare)], 1.0)
 
@@ -57,7 +62,7 @@ def test_rare_rows_are_never_missed() -> None:
 def test_no_chance_is_above_one_and_the_others_keep_their_proportion(count: int) -> None:
     share = np.random.default_rng(1).exponential(size=100) ** 3
     share /= share.sum()
-    chance = inclusion(share, count)
+    chance = inclusion_probabilities(share, count)
     assert chance.sum() == pytest.approx(count)
     assert chance.max() <= 1.0
     free = chance < 1.0
@@ -67,10 +72,12 @@ def test_no_chance_is_above_one_and_the_others_keep_their_proportion(count: int)
 
 def test_the_evidence_is_the_number_of_rows_that_have_something_to_tell() -> None:
     squares = np.array([4.0, 4.0, 4.0, 0.0, 0.0])
-    assert evidence(squares, np.ones(5)) == pytest.approx(3.0)
-    assert evidence(squares, np.array([2.0, 2.0, 2.0, 1.0, 9.0])) == pytest.approx(6.0)
-    assert evidence(1e-200 * squares, np.ones(5)) == pytest.approx(3.0)
-    assert evidence(np.zeros(5), np.full(5, 2.0)) == pytest.approx(10.0)
+    assert effective_target_count(squares, np.ones(5)) == pytest.approx(3.0)
+    assert effective_target_count(squares, np.array([2.0, 2.0, 2.0, 1.0, 9.0])) == pytest.approx(
+        6.0
+    )
+    assert effective_target_count(1e-200 * squares, np.ones(5)) == pytest.approx(3.0)
+    assert effective_target_count(np.zeros(5), np.full(5, 2.0)) == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize("start", [None, np.array([0.3, -0.2, 0.1, -2.0])])
@@ -94,11 +101,11 @@ def test_a_fit_has_weights_a_prior_and_more_than_one_start(
     )
     ((loss, prior, starts),) = asked
     squares = np.sum((targets - targets.mean(axis=0)) ** 2, axis=1)
-    rows, weights = telling_rows(squares, np.random.default_rng(4))
+    rows, weights = pps_subsample(squares, np.random.default_rng(4))
     np.testing.assert_array_equal(loss.features, targets[rows])
     np.testing.assert_allclose(loss.weights, weights / weights.mean())
     assert weights.max() > 2.0 * weights.min()
-    assert prior.strength == pytest.approx(2.0 / evidence(squares[rows], weights))
+    assert prior.strength == pytest.approx(2.0 / effective_target_count(squares[rows], weights))
     np.testing.assert_allclose(prior.centre[:2], np.log(kernel.lengthscales))
     assert regulariser == pytest.approx(1e-3)
     assert [float(np.exp(each[-1])) for each in starts[-2:]] == pytest.approx([1e-3, 0.1])

@@ -17,7 +17,7 @@ from kreps.algorithms.state import LearnerState
 from kreps.algorithms.value_iteration import TOLERANCE, candidate_actions, iterate_values
 from kreps.data.rollout import Rollout, Transitions
 from kreps.data.task import TaskSpec
-from kreps.data.window import Window
+from kreps.data.window import ReplayWindow
 from kreps.envs.swing_up import reward, wrap_angle
 from kreps.errors import ConfigurationError, SpaceError
 from kreps.kernels.arrays import FloatArray
@@ -147,7 +147,7 @@ def test_the_policy_of_an_update_has_the_q_of_brute_force_in_units_of_the_reward
     rollouts = rollouts_of(2, scale=10.0)
     chosen = ValueIterationSettings(actions=5, temperature=temperature, restart_probability=0.3)
     state, info = value_iteration.update(
-        LearnerState(Window(30)), rollouts, TASK, chosen, np.random.default_rng(0)
+        LearnerState(ReplayWindow(30)), rollouts, TASK, chosen, np.random.default_rng(0)
     )
     policy = state.policy
     assert isinstance(policy, SoftmaxPolicy)
@@ -250,7 +250,7 @@ def test_a_fit_starts_where_that_of_the_last_update_ended(monkeypatch: pytest.Mo
         return minimise(loss, prior, *given)
 
     monkeypatch.setattr(transition_model, "minimise", spy)
-    state = LearnerState(Window(30))
+    state = LearnerState(ReplayWindow(30))
     for seed in (1, 2):
         before = state
         state, info = value_iteration.update(
@@ -376,7 +376,7 @@ def test_q_fades_to_its_offset_far_from_the_data() -> None:
     np.testing.assert_allclose(policy.value(far), -40.0)
     assert np.ptp(policy.q_values(np.zeros((1, 2)))) > 0.1
     state, _ = value_iteration.update(
-        LearnerState(Window(30)),
+        LearnerState(ReplayWindow(30)),
         rollouts_of(12),
         TASK,
         ValueIterationSettings(),

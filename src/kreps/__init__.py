@@ -36,20 +36,26 @@ if TYPE_CHECKING:
     )
     from kreps.learning.policy import Policy, load_policy
     from kreps.learning.storage import load_rollouts, rollout_folder, save_rollouts
-    from kreps.settings import RECIPES, Settings
+    from kreps.presets import PRESETS
+    from kreps.settings import RKHS, Exploration, Grid, LowRank, ModelBased, Settings
 
 __all__ = [
     "KREPS",
     "NPALP",
-    "RECIPES",
+    "PRESETS",
+    "RKHS",
     "Compute",
     "ConfigurationError",
     "DataError",
     "Dataset",
     "EnvironmentFailure",
+    "Exploration",
+    "Grid",
     "GridValueIteration",
     "IterationReport",
     "KrepsError",
+    "LowRank",
+    "ModelBased",
     "NumericalError",
     "Policy",
     "RandomRestart",
@@ -78,7 +84,12 @@ _HOMES = {
     "Policy": "learning.policy",
     "load_policy": "learning.policy",
     "RandomRestart": "envs.restart",
-    "RECIPES": "settings",
+    "PRESETS": "presets",
+    "RKHS": "settings",
+    "Exploration": "settings",
+    "Grid": "settings",
+    "LowRank": "settings",
+    "ModelBased": "settings",
     "Settings": "settings",
     "Compute": "data.compute",
     "Dataset": "data.dataset",

@@ -1,42 +1,27 @@
-"""Everything that can be chosen about each learner, with its defaults and named recipes."""
+"""Everything that can be chosen about each learner, in sections, with its defaults."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from math import inf
 from numbers import Integral, Real
-from typing import Any, ClassVar, Literal, TypeVar, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 from kreps.errors import ConfigurationError
 
-Model = Literal["dynamics", "change", "embedding", "sample"]
-Approximation = Literal["auto", "exact", "pivoted", "uniform", "fourier"]
-Features = Literal["rkhs", "grid"]
-Restarts = Literal["independent", "stratified"]
-PolicyFit = Literal["map", "bounded"]
-Angles = Literal["cut", "round"]
-Exploration = Literal["bang-bang", "gaussian", "pink"]
+TransitionModelName = Literal["dynamics", "change", "embedding", "sample"]
+RolloutLengths = Literal["independent", "stratified"]
+PolicyFitName = Literal["map", "bounded"]
+AngleWrap = Literal["discontinuous", "continuous"]
+Noise = Literal["bang-bang", "gaussian", "pink"]
 
 
-@dataclass(frozen=True)
-class LearnerSettings:
-    """What every learner has in common.
+class Checked:
+    """Checks of single fields, for the frozen dataclasses below.
 
-    Attributes:
-        restart_probability: p, with which the process restarts at each step.
-        window: how many of the latest roll-outs are kept, a third of them for those whose rewards
-            tell of the states; None keeps all.
+    Each raises `ConfigurationError` with the value and what it must be.
     """
-
-    restart_probability: float = 0.02
-    window: int | None = 30
-
-    def __post_init__(self) -> None:
-        self._check("restart_probability", Real, "in (0, 1)", lambda v: 0 < v < 1)
-        if self.window is not None:
-            whole = "a whole number >= 1, or None to keep all"
-            self._check("window", Integral, whole, lambda v: v >= 1)
 
     def _choose(self, name: str, kind: Any) -> None:
         if getattr(self, name) not in get_args(kind):
@@ -54,145 +39,257 @@ class LearnerSettings:
             self._check(name, Integral, "a whole number >= 1", lambda v: v >= 1)
 
     def _check(self, name: str, kind: type, limit: str, holds: Callable[[Any], bool]) -> None:
-        """Take numbers of any make, NumPy's too, and keep them as Python's."""
+        """Accept numbers of any type, NumPy's included, and store them as Python's."""
         value = getattr(self, name)
         is_number = isinstance(value, kind) and not isinstance(value, bool)
         if not (is_number and holds(value)):
             raise ConfigurationError(f"{name} = {value!r}, but it must be {limit}")
         object.__setattr__(self, name, int(value) if kind is Integral else float(value))
 
+    def _section(self, name: str, *kinds: type) -> None:
+        value = getattr(self, name)
+        if not isinstance(value, kinds):
+            names = ["None" if k is type(None) else f"kreps.{k.__name__}(...)" for k in kinds]
+            raise ConfigurationError(
+                f"{name} = {value!r}, but it must be {' or '.join(names)}; "
+                f'to change one field, write {{"{name}.field": value}}'
+            )
+
+
+# ---- sections ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Exploration(Checked):
+    """The first policy, which acts until there is a learnt one.
+
+    Attributes:
+        noise: ``"bang-bang"``: each action coordinate at one of its limits, with random sign;
+            ``"gaussian"``: independent normal numbers; ``"pink"``: normal numbers with a power
+            spectrum 1 / f, which also have slow parts.
+        scale: standard deviation of the normal ones, in units of half the action range.
+    """
+
+    noise: Noise = "bang-bang"
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        self._choose("noise", Noise)
+        self._positive("scale")
+
+
+@dataclass(frozen=True)
+class RKHS(Checked):
+    """V in a reproducing-kernel Hilbert space (Eq. 3), in coordinates of a pivoted Cholesky basis.
+
+    Attributes:
+        max_rank: largest number of features of V.
+        tolerance: the basis is complete when no sampled state has a larger squared residual
+            (kernel values are at most 1).
+        angle_wrap: of V and of the reward model.  ``"discontinuous"``: they may jump where the
+            numbers of an angle wrap around, as a reward of the angle's number does.
+            ``"continuous"``: they are periodic, like the dynamics and the policy.
+    """
+
+    max_rank: int = 400
+    tolerance: float = 1e-6
+    angle_wrap: AngleWrap = "discontinuous"
+
+    def __post_init__(self) -> None:
+        self._whole("max_rank")
+        self._positive("tolerance")
+        self._choose("angle_wrap", AngleWrap)
+
+
+@dataclass(frozen=True)
+class Grid(Checked):
+    """V in fixed radial basis functions on a grid (feature-based REPS, Sec. 4.2).
+
+    Attributes:
+        size: centres per observation coordinate.
+    """
+
+    size: int = 10
+
+    def __post_init__(self) -> None:
+        self._whole("size")
+
+
+@dataclass(frozen=True)
+class LowRank(Checked):
+    """Nystroem features in place of kernels, for more samples than an exact update can serve.
+
+    Centres are chosen by pivoted Cholesky on a subsample; sums over samples are taken in chunks.
+
+    Attributes:
+        rank: largest number of features of states and actions, and of centres of the policy.  V has
+            ``RKHS.max_rank``.
+        above: the update is exact up to this many samples, and of low rank with more.
+        subsample: samples in memory from which centres are chosen and on which hyper-parameters
+            are fitted.
+    """
+
+    rank: int = 1000
+    above: int = 3_000
+    subsample: int = 10_000
+
+    def __post_init__(self) -> None:
+        self._whole("rank", "subsample")
+        self._check("above", Integral, "a whole number >= 0", lambda v: v >= 0)
+
+
+@dataclass(frozen=True)
+class ModelBased(Checked):
+    """What goes past the paper: further bounded steps on samples generated by the model.
+
+    It needs a learnt transition model.  Rollouts in the model (``model_rollout_fraction``, the
+    acceptance test, the exploration bonus) need ``model="dynamics"``, no images, and at least ten
+    samples for each coordinate of state and action.
+
+    Attributes:
+        actions_per_state: actions that are generated for each sample.
+        proposal_std_scale: these are sampled with so many times the standard deviation of the
+            policy; the policy fitted to them is divided by it.  1 is used where there is no
+            acceptance test.
+        model_rollout_fraction: share of the generated actions that are taken in states visited in
+            model rollouts of the new policy, in a second step; the others are taken in replayed
+            states, in the first one.
+        acceptance_rollouts: model rollouts per policy in the acceptance test.  The previous policy
+            is kept if the new return is lower by more than one standard error; 0 accepts all.
+        exploration_bonus: of R-max: reward per step of an unexplored region, as a share of the way
+            from the average reward to the best one.  It decays to 0.35 of itself at each update;
+            0 leaves it out.
+        max_samples: largest number of generated actions of an update.
+    """
+
+    actions_per_state: int = 4
+    proposal_std_scale: float = 1.2
+    model_rollout_fraction: float = 0.5
+    acceptance_rollouts: int = 50
+    exploration_bonus: float = 0.1
+    max_samples: int = 20_000
+
+    def __post_init__(self) -> None:
+        self._whole("actions_per_state", "max_samples")
+        self._check("proposal_std_scale", Real, "finite and >= 1", lambda v: 1 <= v < inf)
+        self._check("model_rollout_fraction", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
+        none_or_some = "0, or a whole number >= 2"
+        self._check("acceptance_rollouts", Integral, none_or_some, lambda v: v == 0 or v >= 2)
+        self._check("exploration_bonus", Real, "finite and >= 0", lambda v: 0 <= v < inf)
+
+
+# ---- learners ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LearnerSettings(Checked):
+    """What every learner has in common.
+
+    Attributes:
+        restart_probability: p, with which the process restarts at each step.
+        window: how many of the latest rollouts are kept; a third of the places is reserved for
+            rollouts with a state-dependent reward.  None keeps all.
+    """
+
+    restart_probability: float = 0.02
+    window: int | None = 30
+
+    def __post_init__(self) -> None:
+        self._check("restart_probability", Real, "in (0, 1)", lambda v: 0 < v < 1)
+        if self.window is not None:
+            whole = "a whole number >= 1, or None to keep all"
+            self._check("window", Integral, whole, lambda v: v >= 1)
+
 
 @dataclass(frozen=True)
 class OnPolicySettings(LearnerSettings):
     """How a learner that explores by its own policy collects its data (Sec. 4.1).
 
-    A roll-out lasts (1 - p) / p steps on expectation.  Beside `LearnerSettings`:
+    A rollout has (1 - p) / p steps on expectation.  Beside `LearnerSettings`:
 
     Attributes:
-        exploration: first policy, ``"bang-bang"`` (limits with random sign), ``"gaussian"`` or
-            ``"pink"``, a Gaussian one with noise that has slow parts as well as fast ones.
-        exploration_scale: standard deviation of the Gaussian ones, in units of half the range.
-        initial_rollouts: roll-outs before the first update.
-        rollouts_per_iteration: roll-outs before each later one, of the current policy; or at the
-            limits with slow noise while no reward tells of the states.
-        restarts: lengths of these roll-outs, ``"independent"``, as printed, or ``"stratified"``: as
-            random each, but one from each of as many equally likely ranges of lengths, so that a
-            batch has nearly as many steps as are expected.
+        exploration: the first policy.
+        initial_rollouts: rollouts before the first update.
+        rollouts_per_iteration: rollouts before each later one, of the current policy; or with
+            bang-bang actions and red noise while no reward depends on the state.
+        rollout_lengths: ``"independent"``, as printed; or ``"stratified"``: each has the same
+            distribution, but a batch has one from each of as many equally likely ranges, so that
+            its number of steps varies little.
     """
 
-    exploration: Exploration = "bang-bang"
-    exploration_scale: float = 1.0
+    exploration: Exploration = field(default_factory=Exploration)
     initial_rollouts: int = 30
     rollouts_per_iteration: int = 10
-    restarts: Restarts = "independent"
+    rollout_lengths: RolloutLengths = "independent"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._choose("exploration", Exploration)
-        self._choose("restarts", Restarts)
-        self._positive("exploration_scale")
+        self._section("exploration", Exploration)
+        self._choose("rollout_lengths", RolloutLengths)
         self._whole("initial_rollouts", "rollouts_per_iteration")
 
 
 @dataclass(frozen=True)
 class Settings(OnPolicySettings):
-    """The parameters of REPS with RKHS embeddings; the defaults are the recipe ``"default"``.
+    """The parameters of REPS with RKHS embeddings; the defaults are the preset ``"model_based"``.
 
     Those of `OnPolicySettings`, and:
 
     Attributes:
         kl_bound: epsilon of Eq. 2 in nats: how far one update may move from the samples.
-        eta_floor: least temperature, in standard deviations of the reward.  Near convergence the
-            optimum of the dual falls to zero and the KL bound would chase noise; a floor lets the
-            bound go slack instead.  0 leaves only a numerical safeguard of 1e-6; None takes 0.01
-            where policies are judged, see below, and 0.05 where they are not.
-        ridge: rho times the number of samples; the softness of the stationarity constraint.  None
-            takes the mean squared leave-one-out error of the transition model: stationarity is
-            asked for as strictly as successors can be predicted (but not below 0.001).
+        eta_floor: smallest temperature, in standard deviations of the reward.  Near convergence the
+            optimum of the dual falls to zero, and the update would fit noise until the KL bound is
+            met; with a floor the bound may stay slack.  0 leaves a numerical safeguard of 1e-6;
+            None takes 0.01 where there is an acceptance test and 0.05 where there is none.
+        ridge: rho times the number of samples: the softness of the stationarity constraint.  None
+            takes the mean squared leave-one-out error of the transition model in feature space
+            (but at least 0.001), so that stationarity is asked for as strictly as successors can
+            be predicted.
         exploring_starts: share of the random restarts that an update plans with in any of the
-            sampled states instead of the start states, so that V is learnt beside the way, too; and
-            of the imagined roll-outs that begin there.  Real ones begin where the environment does.
-        imagined: actions per state that are drawn anew for a second bounded step, in which the
-            model says what they lead to; 0 leaves that step out, and while no reward tells of the
-            states there is none.
-        imagined_noise: these actions are drawn with so many times the deviation of the policy, and
-            that of the policy fitted to them is divided by it; where that is judged, see below.
-        imagined_rollouts: share of these actions that a third step takes, in states that the policy
-            of the second is led to in roll-outs simulated by the model ``"dynamics"``.  There are
-            none in images, nor with fewer than ten samples for each coordinate of state and action.
-        judging_rollouts: simulated likewise, of the new policy and of the one before, which acts on
-            if the new one earns less by more than the standard error; 0 takes every new one, as it
-            is where nothing is imagined.
-        optimism: about what no sample is like, where roll-outs can be simulated: share of the way
-            from the average reward to the best one that it is thought to earn, step after step
-            until the restart.  It falls to 0.35 of itself at each update.  0.1 leads out of a local
-            optimum that the first roll-outs show nothing beyond; 0 leaves it out.
-        angles: for V and for the reward that a model expects: ``"cut"`` where their numbers begin
-            anew, as a reward of the number may jump there, or ``"round"``, as for the dynamics and
-            the policy.  On a grid they are round.
-        model: transition model: ``"dynamics"`` regresses how the state changes, after a linear
-            trend, and takes the features of V where that leads; ``"change"`` embeds how the
-            features change, so that far from the data the state stays; ``"embedding"`` embeds the
-            successor itself, as printed (Eq. 4); ``"sample"`` takes the observed successor.
-        features: of V, ``"rkhs"`` (Eq. 3) or ``"grid"`` (fixed radial basis functions).
-        grid_size: centres per coordinate of the grid.
+            sampled states instead of the start states, so that V is also learnt beside the way;
+            and of the model rollouts that begin there.  Real rollouts begin where the environment
+            does.
+        model: transition model.  ``"dynamics"`` regresses the change of the state, after a linear
+            mean, and evaluates V's features at the predicted successor; ``"change"`` embeds the
+            change of the features, so that far from the data the state stays; ``"embedding"``
+            embeds the features of the successor, as printed (Eq. 4); ``"sample"`` uses the
+            observed successor.
         policy_fit: hyper-parameters of the policy by leave-one-out density, ``"map"`` with priors
             or ``"bounded"`` within hard ranges.
-        max_rank: most features of V.
-        basis_tolerance: the basis of V is complete when no state has a larger squared residual.
-        approximation: ``"exact"``, or features in place of kernels: Nystroem's with pivots
-            chosen by pivoted Cholesky (``"pivoted"``) or at random (``"uniform"``), or random
-            Fourier features (``"fourier"``; the policy then has Nystroem's, chosen by pivots).
-            ``"auto"`` is exact up to 3000 samples and pivoted above.
-        rank: most features of states and actions and most centres of the policy where they are
-            approximated; V has ``max_rank``.
+        value: where the features of V come from: `RKHS` or `Grid`.
+        low_rank: `LowRank`, or None for an exact update whatever the number of samples.
+        model_based: `ModelBased`, or None: the paper's single step on the sampled actions.
     """
 
-    restarts: Restarts = "stratified"
+    rollout_lengths: RolloutLengths = "stratified"
     kl_bound: float = 1.0
     eta_floor: float | None = None
     ridge: float | None = None
     exploring_starts: float = 0.25
-    imagined: int = 4
-    imagined_noise: float = 1.2
-    imagined_rollouts: float = 0.5
-    judging_rollouts: int = 50
-    optimism: float = 0.1
-    angles: Angles = "cut"
-    model: Model = "dynamics"
-    features: Features = "rkhs"
-    grid_size: int = 10
-    policy_fit: PolicyFit = "map"
-    max_rank: int = 400
-    basis_tolerance: float = 1e-6
-    approximation: Approximation = "auto"
-    rank: int = 1000
+    model: TransitionModelName = "dynamics"
+    policy_fit: PolicyFitName = "map"
+    value: RKHS | Grid = field(default_factory=RKHS)
+    low_rank: LowRank | None = field(default_factory=LowRank)
+    model_based: ModelBased | None = field(default_factory=ModelBased)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._choose("model", Model)
-        self._choose("features", Features)
-        self._choose("policy_fit", PolicyFit)
-        self._choose("angles", Angles)
-        self._choose("approximation", Approximation)
-        self._positive("kl_bound", "basis_tolerance")
+        self._choose("model", TransitionModelName)
+        self._choose("policy_fit", PolicyFitName)
+        self._positive("kl_bound")
         if self.ridge is not None:
             self._check("ridge", Real, "positive and finite, or None", lambda v: 0 < v < inf)
         if self.eta_floor is not None:
             self._check("eta_floor", Real, "finite and >= 0, or None", lambda v: 0 <= v < inf)
         self._check("exploring_starts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
-        self._check("imagined_noise", Real, "finite and >= 1", lambda v: 1 <= v < inf)
-        self._check("imagined_rollouts", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
-        none_or_some = "0, or a whole number >= 2"
-        self._check("judging_rollouts", Integral, none_or_some, lambda v: v == 0 or v >= 2)
-        self._check("imagined", Integral, "a whole number >= 0", lambda v: v >= 0)
-        self._check("optimism", Real, "finite and >= 0", lambda v: 0 <= v < inf)
-        self._whole("max_rank", "grid_size", "rank")
-        if self.model == "sample" and (self.imagined or self.ridge is None):
+        self._section("value", RKHS, Grid)
+        self._section("low_rank", LowRank, type(None))
+        self._section("model_based", ModelBased, type(None))
+        if self.model == "sample" and (self.model_based is not None or self.ridge is None):
             raise ConfigurationError(
-                f'model = "sample" with imagined = {self.imagined} and ridge = {self.ridge}, but '
-                "without a learnt model no other action can be imagined and no error be estimated; "
-                'start from recipe="observed", or set imagined=0 and ridge=0.1'
+                f'model = "sample" with model_based = {self.model_based} and ridge = {self.ridge}, '
+                "but without a learnt model no sample can be generated and no error be estimated; "
+                'start from preset="single_step", or set model_based=None and ridge=0.1'
             )
 
 
@@ -277,58 +374,3 @@ class NPALPSettings(OnPolicySettings):
         super().__post_init__()
         self._positive("lipschitz", "noise_scale")
         self._check("noise_fraction", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
-
-
-AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
-
-OBSERVED = Settings(
-    restarts="independent",
-    eta_floor=0.1,
-    ridge=0.1,
-    exploring_starts=0.0,
-    imagined=0,
-    angles="round",
-    model="change",
-)
-
-RECIPES: dict[str, Settings] = {
-    "default": Settings(),
-    "observed": OBSERVED,
-    "paper": replace(
-        OBSERVED, kl_bound=0.5, eta_floor=0.02, model="embedding", policy_fit="bounded"
-    ),
-}
-"""``"paper"`` follows the printed method where it is printed, with a low floor against a vanishing
-temperature (``eta_floor=0`` takes it away).  ``"observed"`` makes one step too, on the
-actions that were taken, with the changes that were found to learn faster.  ``"default"``
-goes past the paper; docs/deviations.md says how, and what it gains."""
-
-
-def settings_of(recipe: str | Settings = "default", /, **changes: Any) -> Settings:
-    """The named (or given) recipe with some parameters changed.
-
-    Raises:
-        ConfigurationError: unknown recipe or parameter, or a value out of range.
-    """
-    if isinstance(recipe, str) and recipe in RECIPES:
-        recipe = RECIPES[recipe]
-    if not isinstance(recipe, Settings):
-        raise ConfigurationError(
-            f"recipe {recipe!r} is unknown; choose one of {', '.join(map(repr, RECIPES))}"
-        )
-    return changed(recipe, changes)
-
-
-def changed(settings: AnySettings, changes: Mapping[str, Any]) -> AnySettings:
-    """The settings with some parameters changed.
-
-    Raises:
-        ConfigurationError: unknown parameter, or a value out of range.
-    """
-    known = [f.name for f in fields(settings)]
-    unknown = [name for name in changes if name not in known]
-    if unknown:
-        raise ConfigurationError(
-            f"unknown parameter {', '.join(unknown)}; the parameters are {', '.join(known)}"
-        )
-    return replace(settings, **changes)

@@ -1,8 +1,12 @@
-"""How bold an update may be: bolder where its policy is judged before it acts.
+"""The policy acceptance test: a new policy must not be worse than the previous one in the model.
 
-A low temperature and imagined actions that are wider than those taken both gain most of the time
-and go wrong some of the time.  Where `kreps.algorithms.judgement` keeps from acting what went
-wrong, both pay; where nothing can be simulated, as in images, neither does.
+A one-step update can exploit errors of V and of the model together.  Long model rollouts do not
+use V, so the new and the previous policy are compared by them, with common random numbers.  The
+previous policy acts again where the new one is worse.
+
+Far from the samples the model predicts an average reward, which late in learning is a good one.
+So rewards of states that are unlike any sample are shrunk towards the smallest one observed.  While
+there is an exploration bonus, these states get that bonus instead.
 """
 
 from __future__ import annotations
@@ -11,81 +15,75 @@ from dataclasses import replace
 
 import numpy as np
 
-from kreps.algorithms.dual import ETA_LEAST
+from kreps.algorithms.dual import MIN_ETA
 from kreps.kernels.arrays import FloatArray
-from kreps.models.model_env import Followed, Simulator, average_reward
-from kreps.models.world_model import Outlook
+from kreps.models.model_env import ModelRollouts, average_reward
+from kreps.models.world_model import WorldModel
 from kreps.policies.base import StochasticPolicy
-from kreps.settings import Settings
+from kreps.settings import ModelBased, Settings
+
+ETA_FLOOR_WITH_ACCEPTANCE_TEST = 0.01
+ETA_FLOOR_WITHOUT_ACCEPTANCE_TEST = 0.05
+"""Smallest temperatures where ``eta_floor`` is None, in standard deviations of the reward.  Where a
+task begins with large costs, these make up the standard deviation, and the cost of holding a goal
+badly, about a hundredth of it per step, is not resolved at the higher floor.  Without an acceptance
+test the lower one lets the update exploit errors of the model."""
 
 
-def refuses(
+def rejects(
     new: StochasticPolicy,
-    before: StochasticPolicy | None,
-    outlook: Outlook,
-    settings: Settings,
+    previous: StochasticPolicy | None,
+    world: WorldModel,
+    rollouts: int,
     rng: np.random.Generator,
 ) -> bool | None:
-    """Whether a new policy earns less than the one before, by more than the standard error.
+    """Whether the new policy earns less than the previous one by more than one standard error.
 
-    That error is of starts and noise; of its own errors the model knows nothing.
+    The standard error is that of start states and noise; it does not contain errors of the model.
 
     Args:
-        new, before: with their noise; None before the first update.
-        outlook: what the model says.
-        settings: ``judging_rollouts`` of each policy.
-        rng: of the roll-outs.
+        new, previous: both with their exploration noise; None before the first update.
+        world: the learnt model.
+        rollouts: model rollouts per policy; 0 for no test.
+        rng: of the rollouts.
 
     Returns:
-        None where nothing can be judged, or is to be.
+        None where there is no test.
     """
-    count = settings.judging_rollouts
-    if before is None or outlook.simulator is None or not count:
+    if previous is None or world.model_env is None or not rollouts:
         return None
-    process = replace(outlook.simulator, exploring_starts=0.0)
-    followed, followed_before = process.follow((new, before), outlook.rewards_of, count, rng)
-    typical = max(float(np.median(followed_before.likeness)), np.finfo(np.float64).tiny)
+    model_env = replace(world.model_env, exploring_starts=0.0)
+    of_new, of_previous = model_env.evaluate((new, previous), world.expected_rewards, rollouts, rng)
+    typical = max(float(np.median(of_previous.similarity)), np.finfo(np.float64).tiny)
 
-    def earned(each: Followed) -> FloatArray:
-        hope = outlook.optimism
-        if hope is None:
-            rewards = each.feared_rewards(outlook.rewards.min(), typical)
+    def returns(each: ModelRollouts) -> FloatArray:
+        if world.bonus is None:
+            rewards = each.pessimistic_rewards(world.rewards.min(), typical)
         else:
-            rewards = hope.hoped_rewards(each)
-        return average_reward(rewards, process.restart_probability)
+            rewards = world.bonus.optimistic_rewards(each)
+        return average_reward(rewards, model_env.restart_probability)
 
-    gain = earned(followed) - earned(followed_before)
-    return bool(gain.mean() < -gain.std(ddof=1) / np.sqrt(count))
-
-
-ETA_FLOOR_JUDGED = 0.01
-ETA_FLOOR_NOT_JUDGED = 0.05
-"""Least temperatures where none is asked for, in standard deviations of the reward.  Where a task
-begins with large costs these are the deviation, and what a goal held badly loses at each step,
-about a hundredth of it, is not seen at the higher floor.  Not judged, the lower one lets errors of
-the model through."""
+    gain = returns(of_new) - returns(of_previous)
+    return bool(gain.mean() < -gain.std(ddof=1) / np.sqrt(rollouts))
 
 
-def is_judged(simulator: Simulator | None, settings: Settings) -> bool:
-    """Whether new policies are followed in the learnt dynamics beside the one before.
+def temperature_floor(tested: bool, settings: Settings) -> float:
+    """Smallest eta of the dual, in standard deviations of the reward: as set, or by default.
 
-    The first one has none beside it, and follows noise, from which there is little to fall.
+    Args:
+        tested: whether the new policy has to pass the acceptance test.
+        settings: ``eta_floor``.
     """
-    return simulator is not None and settings.judging_rollouts > 0
-
-
-def least_temperature(judged: bool, settings: Settings) -> float:
-    """Of the dual, in standard deviations of the reward: ``eta_floor`` if there is one."""
     floor = settings.eta_floor
     if floor is None:
-        floor = ETA_FLOOR_JUDGED if judged else ETA_FLOOR_NOT_JUDGED
-    return max(floor, ETA_LEAST)
+        floor = ETA_FLOOR_WITH_ACCEPTANCE_TEST if tested else ETA_FLOOR_WITHOUT_ACCEPTANCE_TEST
+    return max(floor, MIN_ETA)
 
 
-def widening(judged: bool, settings: Settings) -> float:
-    """With how many deviations of a policy its actions are imagined: ``imagined_noise``.
+def proposal_std_scale(tested: bool, model_based: ModelBased) -> float:
+    """Factor by which the policy's standard deviation is inflated when actions are generated.
 
-    One that then acts with as much less is soon sure of itself, so it has to be judged: where
-    it is not, 1.
+    The policy fitted to them is deflated by the same factor and soon explores little, so it is 1
+    where there is no acceptance test.
     """
-    return settings.imagined_noise if judged else 1.0
+    return model_based.proposal_std_scale if tested else 1.0

@@ -18,7 +18,7 @@ import numpy as np
 
 from kreps.kernels.arrays import Array, FloatArray, as_numpy, namespace
 
-ETA_LEAST = 1e-6
+MIN_ETA = 1e-6
 """Floor of the temperature where none is asked for: below it there is nothing left to gain."""
 
 

@@ -1,4 +1,4 @@
-"""Algorithm 1 on all samples in memory, exactly."""
+"""The lines of Algorithm 1 on all samples in memory, exactly: the cost is cubic in their number."""
 
 from __future__ import annotations
 
@@ -9,60 +9,62 @@ import numpy as np
 
 from kreps.algorithms.dual import DualProblem, DualSolution, standardise
 from kreps.algorithms.newton import solve_dual
-from kreps.algorithms.reps import (
-    Expectation,
+from kreps.algorithms.policy_targets import (
     PolicyFit,
-    PolicySamples,
-    ValueFeatures,
-    drawn_noise,
+    PolicyTargets,
+    exploration_noise,
     policy_hyperparameters,
-    stationarity_ridge,
 )
-from kreps.algorithms.state import LearnerState, Stopwatch
+from kreps.algorithms.reps import Expectation, ValueFeatures, stationarity_ridge
+from kreps.algorithms.state import Stopwatch, exact_transitions
 from kreps.data.rollout import Rollout
-from kreps.data.task import TaskSpec
+from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.basis import RBFGrid, RKHSBasis
+from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis
 from kreps.kernels.kernel import Kernel
-from kreps.models.dynamics import fit_dynamics, observed_expectation
+from kreps.models.dynamics import expected_features_of_samples, fit_dynamics
 from kreps.models.transition import (
     feature_differences,
     fit_embedding,
     fit_regression,
     restart_features,
-    with_cuts,
+    with_wrap_discontinuity,
 )
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT, CostSensitiveGP
-from kreps.settings import Settings
+from kreps.settings import Grid, Settings
 
 
 class ExactBatch:
-    """Every sample counts by its kernel function: the update costs their cube."""
+    """All samples of the replay window.
+
+    Raises:
+        ConfigurationError: more samples than an exact update can serve.
+    """
 
     def __init__(
         self,
-        state: LearnerState,
+        window: ReplayWindow,
         rollouts: Sequence[Rollout],
-        task: TaskSpec,
         settings: Settings,
         clock: Stopwatch,
     ) -> None:
-        self.task, self.settings, self.clock = task, settings, clock
-        self.window, self.data = state.extended(rollouts, task)
+        self.window, self.task, self.settings, self.clock = window, window.task, settings, clock
+        self.data = exact_transitions(window)
         self.rewards, self.reward_unit = standardise(self.data.rewards)
         self.size, self.seen = len(self.data), (len(rollouts), sum(map(len, rollouts)))
-        self.actions = np.concatenate([r.actions for r in rollouts or self.window.rollouts])
+        self.actions = np.concatenate([r.actions for r in rollouts or window.rollouts])
         self.jitters: list[float] = []
         self.from_dataset = False
 
-    def value_features(self, kernel: Kernel, rng: np.random.Generator) -> ValueFeatures:
-        data, settings = self.data, self.settings
-        if settings.features == "grid":
-            basis, phi = RBFGrid.over(kernel.factors, data.points, settings.grid_size)
+    def value_features(self, kernel: Kernel) -> ValueFeatures:
+        data, value = self.data, self.settings.value
+        basis: Basis
+        if isinstance(value, Grid):
+            basis, phi = RBFGrid.over(kernel.factors, data.points, value.size)
         else:
-            cut = with_cuts(kernel, data, self.task, settings)
+            kernel = with_wrap_discontinuity(kernel, data, self.task, value)
             basis, phi = RKHSBasis.fit(
-                cut, data.points, tolerance=settings.basis_tolerance, max_rank=settings.max_rank
+                kernel, data.points, tolerance=value.tolerance, max_rank=value.max_rank
             )
         self.clock.lap("basis")
         start = phi[data.start].mean(axis=0)
@@ -75,43 +77,67 @@ class ExactBatch:
         start: FloatArray | None,
         rng: np.random.Generator,
     ) -> Expectation:
-        data, task, settings = self.data, self.task, self.settings
-        basis, own, observed, after_end = vars(features).values()
-        if settings.model == "dynamics":
-            dynamics, x, jitter = fit_dynamics(data, kernel, task, start, rng)
-            self.clock.lap("embedding fit")
-            expected, errors = observed_expectation(
-                data, basis, own, observed, after_end, dynamics, task
-            )
-            of_actions = partial(dynamics.expected_features, basis, after_end)
-            found = Expectation(expected, errors, of_actions, x, dynamics)
+        if self.settings.model == "dynamics":
+            found = self._dynamics(features, kernel, start, rng)
         else:
-            origin = np.zeros_like(own) if settings.model == "embedding" else own
-            successors = np.where(data.terminated[:, None], after_end, observed) - origin
-            if settings.model == "sample":
-                self.clock.lap("embedding fit")
-                found = Expectation(origin + successors, None, None, None, None)
-                jitter = 0.0
-            else:
-                model, x = fit_embedding(data, successors, kernel, task, start, rng)
-                self.clock.lap("embedding fit")
-                predict, jitter = model.predictor(successors), model.factor.jitter
-                found = Expectation(
-                    origin + model.expected_features(successors),
-                    model.leave_one_out(successors),
-                    lambda rows, inputs: origin[rows] + predict(inputs),
-                    x,
-                    None,
-                )
-        self.jitters.append(jitter)
+            found = self._embedding(features, kernel, start, rng)
         self.clock.lap("embedding")
         return found
+
+    def _dynamics(
+        self,
+        features: ValueFeatures,
+        kernel: Kernel,
+        start: FloatArray | None,
+        rng: np.random.Generator,
+    ) -> Expectation:
+        """Features of V at the successor that a regression of the state's change predicts."""
+        dynamics, x, jitter = fit_dynamics(self.data, kernel, self.task, start, rng)
+        self.jitters.append(jitter)
+        self.clock.lap("embedding fit")
+        basis, after_end = features.basis, features.start
+        expected, errors = expected_features_of_samples(
+            self.data, basis, features.own, features.observed, after_end, dynamics, self.task
+        )
+        for_actions = partial(dynamics.expected_features, basis, after_end)
+        return Expectation(expected, errors, for_actions, x, dynamics)
+
+    def _embedding(
+        self,
+        features: ValueFeatures,
+        kernel: Kernel,
+        start: FloatArray | None,
+        rng: np.random.Generator,
+    ) -> Expectation:
+        """Eq. 4 on the features of successors, as printed or less those of the state itself.
+
+        An embedding fades to its origin far from the data.  That the state stays is a better guess
+        there than that its features vanish.
+        """
+        data, model = self.data, self.settings.model
+        origin = np.zeros_like(features.own) if model == "embedding" else features.own
+        observed = np.where(data.terminated[:, None], features.start, features.observed)
+        targets = observed - origin
+        if model == "sample":
+            self.clock.lap("embedding fit")
+            return Expectation(origin + targets, None, None, None, None)
+        embedding, x = fit_embedding(data, targets, kernel, self.task, start, rng)
+        self.jitters.append(embedding.factor.jitter)
+        self.clock.lap("embedding fit")
+        predict = embedding.predictor(targets)
+        return Expectation(
+            origin + embedding.expected_features(targets),
+            embedding.leave_one_out(targets),
+            lambda rows, inputs: origin[rows] + predict(inputs),
+            x,
+            None,
+        )
 
     def solve_dual(
         self, features: ValueFeatures, model: Expectation, eta_floor: float
     ) -> tuple[DualProblem, DualSolution]:
         settings, own = self.settings, features.own
-        restart = restart_features(features.start, own.mean(axis=0), settings)
+        restart = restart_features(features.start, own.mean(axis=0), settings.exploring_starts)
         problem = DualProblem(
             rewards=self.rewards,
             differences=feature_differences(
@@ -128,43 +154,43 @@ class ExactBatch:
     def fit_policy_to_data(
         self, p: FloatArray, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
     ) -> PolicyFit:
-        return self.fit_policy(PolicySamples.of(self.data, p, self.task), kernel, start, rng)
+        targets = PolicyTargets.from_samples(self.data, p, self.task)
+        return self.fit_policy(targets, kernel, start, rng)
 
     def fit_policy(
         self,
-        samples: PolicySamples,
+        targets: PolicyTargets,
         kernel: Kernel,
         start: FloatArray | None,
         rng: np.random.Generator,
-        narrower: float = 1.0,
+        std_scale: float = 1.0,
     ) -> PolicyFit:
-        samples = samples.heaviest(MAX_SUPPORT)
-        x = policy_hyperparameters(samples, kernel, self.settings, start, rng)
+        targets = targets.top_by_weight(MAX_SUPPORT)
+        x = policy_hyperparameters(targets, kernel, self.settings.policy_fit, start, rng)
         self.clock.lap("policy fit")
-        weights, noise = drawn_noise(samples, float(np.exp(x[-1])))
+        weights, noise = exploration_noise(targets, float(np.exp(x[-1])))
         policy = CostSensitiveGP(
             self.task,
             kernel.with_lengthscales(np.exp(x[:-2])),
-            samples.states,
-            samples.targets,
+            targets.states,
+            targets.targets,
             weights,
-            signal=float(np.exp(x[-2])) / narrower**2,  # of process and noise: the mean stays
-            noise=noise / narrower**2,
+            signal=float(np.exp(x[-2])) / std_scale**2,  # as the noise, so that the mean stays
+            noise=noise / std_scale**2,
         )
         self.jitters.append(policy.jitter)
         self.clock.lap("policy")
-        return PolicyFit(policy, x, len(samples.weights))
+        return PolicyFit(policy, x, len(targets.weights), policy.noise)
 
     def fit_reward(
         self, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
     ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]:
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
         targets = (self.rewards - self.rewards.mean())[:, None]
-        cut = with_cuts(kernel, self.data, self.task, self.settings)
-        regression, x = fit_regression(self.data, targets, cut, self.task, start, rng)
+        kernel = with_wrap_discontinuity(kernel, self.data, self.task, self.settings.value)
+        regression, x = fit_regression(self.data, targets, kernel, self.task, start, rng)
         self.jitters.append(regression.factor.jitter)
         return regression.predictor(targets), x
 
-    def of_data(self, p: FloatArray) -> FloatArray:
-        """Weights of the samples in memory, of those of all."""
+    def weights_in_memory(self, p: FloatArray) -> FloatArray:
         return p

@@ -1,115 +1,137 @@
-"""A second bounded step on actions drawn anew, with the transition model saying what they lead to.
+"""Samples that the transition model generates: actions around the policy's, in replayed states or
+in states that the policy visits in model rollouts.
 
-The weights of Eq. 1 can only choose among the actions that happened to be taken, one in each state.
-A transition model predicts for *any* action, so more can be asked of the same roll-outs: in the
-states as the first step reweighted them actions are drawn from its policy, and the same convex
-problem is solved once more for them.  The KL bound then holds from what they were drawn from, so
-that old roll-outs no longer tie the new policy to the old ones that made them.  And the policy so
-found is led by the model to states that no sample is in: there the same is done once again.
-
-What is compared in the model can be wide, and what is done in the world narrow: actions are drawn
-with more than the policy's deviation, and the one fitted to them acts with as much less of its own.
+The weights of Eq. 1 can only choose among the actions that were taken, one in each state.  A
+transition model predicts the successor of any action, so the same convex problem can be solved
+again for several actions per state.  The KL bound then holds relative to the distribution that
+the actions were sampled from, no longer relative to the mixture of old policies in the window.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 
 import numpy as np
 
-from kreps.algorithms.acceptance import is_judged, least_temperature, widening
+from kreps.algorithms.acceptance import proposal_std_scale, temperature_floor
 from kreps.algorithms.dual import DualProblem
-from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray, IntArray
-from kreps.kernels.sampling import resample
+from kreps.kernels.sampling import systematic_resampling
 from kreps.models.dynamics import after_ends
 from kreps.models.transition import feature_differences
-from kreps.models.world_model import Outlook
+from kreps.models.world_model import WorldModel
 from kreps.policies.base import StochasticPolicy
-from kreps.settings import Settings
+from kreps.settings import ModelBased, Settings
 
-MOST_IMAGINED = 20_000
-"""Samples at most: what the model expects of each, a number a feature of V, is held in memory."""
+
+class StateSource(Enum):
+    """Which states actions are generated in."""
+
+    REPLAY = "replay"
+    """Sampled states, resampled by the weights of the step before."""
+
+    MODEL_ROLLOUT = "model rollout"
+    """States visited in model rollouts of the policy of the step before."""
 
 
 @dataclass(frozen=True)
-class ImaginedSamples:
-    """m actions drawn in k states.
+class GeneratedSamples:
+    """m generated actions in k states.
 
     Attributes:
         states: (k, ds).
-        of: (m,) which of the states each action is drawn in, in order.
+        state_of: (m,) which of the states each action is taken in, in order.
         actions: (m, da) commanded, in the task's units.
-        problem: rewards and differences of features as the model expects them.
+        problem: the dual, with expected rewards and feature differences.
     """
 
     states: FloatArray
-    of: IntArray
+    state_of: IntArray
     actions: FloatArray
     problem: DualProblem
 
 
-def counts(outlook: Outlook, settings: Settings) -> tuple[int, int]:
-    """How many actions are imagined in sampled states, and in states that a policy is led to."""
-    whole = min(settings.imagined * len(outlook.states), MOST_IMAGINED)
-    ahead = round(settings.imagined_rollouts * whole) if outlook.simulator is not None else 0
-    return whole - ahead, ahead
+def split_budget(world: WorldModel, model_based: ModelBased) -> dict[StateSource, int]:
+    """How many actions are generated per source of states, for the sources that have any."""
+    budget = min(model_based.actions_per_state * len(world.states), model_based.max_samples)
+    visited = 0
+    if world.model_env is not None:
+        visited = round(model_based.model_rollout_fraction * budget)
+    counts = {StateSource.REPLAY: budget - visited, StateSource.MODEL_ROLLOUT: visited}
+    return {source: count for source, count in counts.items() if count}
 
 
-def places(outlook: Outlook, settings: Settings) -> tuple[bool, ...]:
-    """Where actions are imagined, step after step: not led, in sampled states, then led."""
-    sampled, ahead = counts(outlook, settings)
-    return (False,) * (sampled > 0) + (True,) * (ahead > 0)
-
-
-def imagine(
-    outlook: Outlook,
+def generate(
+    world: WorldModel,
     weights: FloatArray,
     policy: StochasticPolicy,
-    task: TaskSpec,
+    source: StateSource,
     settings: Settings,
     ridge: float,
+    tested: bool,
     rng: np.random.Generator,
-    led: bool = False,
-) -> ImaginedSamples:
-    """Actions around the policy's in states drawn by the weights (n,) or in states it is led to.
+) -> GeneratedSamples:
+    """Actions sampled around the policy's, with expected rewards and features of successors.
 
     Args:
-        outlook, weights: of n samples.
-        policy: to draw actions from.
-        task: limits and scale of the actions.
-        settings: ``imagined`` draws a sample, up to `MOST_IMAGINED` in both places, with
-            ``imagined_noise``; the share of them in ``imagined_rollouts``; the bounds.
-        ridge: rho times the number of draws.
-        rng: of the draws.
-        led: whether the states are those of simulated roll-outs of the policy, as many as there are
-            samples: one of `places`.
+        world: the learnt model of n samples.
+        weights: (n,) by which sampled states are drawn.
+        policy: from which actions are sampled, with inflated standard deviation.
+        source: of the states.
+        settings: ``model_based``, and the bounds of the dual.
+        ridge: rho times the number of samples.
+        tested: whether the new policy has to pass the acceptance test.
+        rng: of states and actions.
     """
-    count = counts(outlook, settings)[led]
-    if led:
-        assert outlook.simulator is not None
-        states, rows = outlook.simulator.rollouts(policy, min(len(weights), count), rng)
-        of = np.arange(count) * len(states) // count
-        features = outlook.features_at(states)
+    model_based = settings.model_based
+    assert model_based is not None
+    count = split_budget(world, model_based)[source]
+    if source is StateSource.MODEL_ROLLOUT:
+        assert world.model_env is not None
+        states, rows = world.model_env.visited_states(policy, min(len(weights), count), rng)
+        state_of = np.arange(count) * len(states) // count
+        features = world.phi(states)
     else:
-        rows, of = np.unique(resample(weights, count, rng), return_inverse=True)
-        states, features = outlook.states[rows], outlook.features[rows]
-    judged = is_judged(outlook.simulator, settings)
-    noise = widening(judged, settings) * rng.standard_normal((count, task.action_size))
-    actions = policy.act(states[of], noise)
-    inputs = np.concatenate([states[of], task.scaled(task.clip(actions))], axis=1)
-    rewards = outlook.rewards_of(inputs)
-    expected = outlook.expect(rows[of], inputs)
+        drawn = systematic_resampling(weights, count, rng)
+        rows, state_of = np.unique(drawn, return_inverse=True)
+        states, features = world.states[rows], world.features[rows]
+    task = world.task
+    std_scale = proposal_std_scale(tested, model_based)
+    noise = std_scale * rng.standard_normal((count, task.action_size))
+    actions = policy.act(states[state_of], noise)
+    inputs = np.concatenate([states[state_of], task.scaled(task.clip(actions))], axis=1)
     p = settings.restart_probability
-    if outlook.optimism is not None:
-        unknown = outlook.unknown_of(inputs)
-        rewards = rewards + unknown * outlook.optimism.surplus(p)
-        expected = after_ends(expected, unknown[:, None], outlook.restart)
+    rewards, expected = expected_outcomes(world, rows[state_of], inputs, p)
     problem = DualProblem(
         rewards=rewards - rewards.max(),
-        differences=feature_differences(features[of], expected, outlook.restart, p),
+        differences=feature_differences(features[state_of], expected, world.restart, p),
         kl_bound=settings.kl_bound,
         ridge=ridge / count,
-        eta_floor=least_temperature(judged, settings),
+        eta_floor=temperature_floor(tested, settings),
     )
-    return ImaginedSamples(states, of, actions, problem)
+    return GeneratedSamples(states, state_of, actions, problem)
+
+
+def expected_outcomes(
+    world: WorldModel, rows: IntArray, inputs: FloatArray, restart_probability: float
+) -> tuple[FloatArray, FloatArray]:
+    """Expected rewards (m,) and features (m, r) of successors, exploration bonus included.
+
+    As in R-max, an unexplored region is an absorbing state that pays an optimistic reward until the
+    restart.  Its total value is added to the reward of the action that leads there, and a restart
+    follows; so V need not represent it.
+
+    Args:
+        world: the learnt model.
+        rows: (m,) samples whose states the actions are taken in or nearest to.
+        inputs: (m, ds + da) states and scaled, applied actions.
+        restart_probability: p.
+    """
+    rewards = world.expected_rewards(inputs)
+    expected = world.expected_features(rows, inputs)
+    if world.bonus is not None:
+        novelty = world.novelty(inputs)
+        rewards = rewards + novelty * world.bonus.exploration_bonus(restart_probability)
+        expected = after_ends(expected, novelty[:, None], world.restart)
+    return rewards, expected

@@ -1,4 +1,8 @@
-"""Algorithm 1 on any number of samples: bases from a sub-sample, sums over chunks of all."""
+"""The lines of Algorithm 1 on any number of samples, in features in place of kernels.
+
+Centres are chosen by pivoted Cholesky on a subsample in memory; every sum over samples is taken
+chunk by chunk, on the workers and in the arrays that `kreps.Compute` names.
+"""
 
 from __future__ import annotations
 
@@ -9,27 +13,30 @@ from operator import add
 
 import numpy as np
 
-from kreps.algorithms.dual import DualProblem, DualSolution, effective_sample_size, standardise
-from kreps.algorithms.newton import solve_dual
-from kreps.algorithms.reps import (
-    DROPPED_WEIGHT,
-    Expectation,
-    PolicyFit,
-    PolicySamples,
-    ValueFeatures,
-    drawn_noise,
-    policy_hyperparameters,
-    stationarity_ridge,
+from kreps.algorithms.dual import (
+    DualProblem,
+    DualSolution,
+    effective_sample_size,
+    standardise,
 )
-from kreps.algorithms.state import LearnerState, Stopwatch
+from kreps.algorithms.newton import solve_dual
+from kreps.algorithms.policy_targets import (
+    MIN_RELATIVE_WEIGHT,
+    PolicyFit,
+    PolicyTargets,
+    exploration_noise,
+    policy_hyperparameters,
+)
+from kreps.algorithms.reps import Expectation, ValueFeatures, stationarity_ridge
+from kreps.algorithms.state import Stopwatch
 from kreps.algorithms.streaming import (
     BellmanRows,
     ChunkPolicySums,
     ChunkRewards,
+    DeltaStateSums,
     EmbeddedSuccessors,
     EmbeddingSums,
     FeatureChanges,
-    MotionSums,
     ObservedSuccessors,
     PredictedSuccessors,
     StartFeatures,
@@ -39,92 +46,102 @@ from kreps.algorithms.streaming import (
 from kreps.data.compute import Compute
 from kreps.data.dataset import Chunk, Dataset
 from kreps.data.rollout import Rollout
-from kreps.data.task import TaskSpec
+from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray, IntArray, as_float
-from kreps.kernels.basis import Basis, FourierBasis, RBFGrid, RKHSBasis
+from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.regression import FeatureRegression, LeaveOneOut, RegressionSums
-from kreps.models.dynamics import Dynamics, Motion, after_ends, observed_expectation
+from kreps.models.dynamics import (
+    DeltaStateTargets,
+    Dynamics,
+    after_ends,
+    expected_features_of_samples,
+)
 from kreps.models.transition import (
     embedding_hyperparameters,
     feature_differences,
     restart_features,
     state_actions,
-    with_cuts,
+    with_wrap_discontinuity,
 )
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 from kreps.policies.sparse_gp import PolicySums, SparseGP
-from kreps.settings import Settings
+from kreps.settings import Grid, LowRank, Settings
 
-SAMPLE = 10_000
+TOLERANCE = 1e-6
+"""Bases of state-actions and of the policy are complete when no input in memory has a larger
+squared residual."""
+
 GROWTH = 4
-
-
-def some(numbers: IntArray, rng: np.random.Generator) -> IntArray:
-    """At most `SAMPLE` of the numbers, in order."""
-    if len(numbers) <= SAMPLE:
-        return numbers
-    return np.sort(rng.choice(numbers, SAMPLE, replace=False))
+"""Factor by which the number of chunks grows from one solve of the dual to the next."""
 
 
 @dataclass(frozen=True)
 class StreamedFeatures(ValueFeatures):
+    """The same, and what computes features of any chunk."""
+
     changes: FeatureChanges
 
 
 @dataclass(frozen=True)
 class StreamedExpectation(Expectation):
+    """The same, and what computes expected features of any chunk."""
+
     successors: Successors
 
 
+Regressed = tuple[FeatureRegression, LeaveOneOut, FloatArray]
+"""A regression of all samples, its errors on those in memory, and its log hyper-parameters."""
+
+
 class LowRankBatch:
-    """Features in place of kernels, and every sum over samples taken chunk by chunk."""
+    """All samples of the window or of a data set, of which a subsample is held in memory.
+
+    Raises:
+        DataError: a chunk with observations or actions of another width than the task's.
+    """
 
     def __init__(
         self,
-        state: LearnerState,
-        rollouts: Sequence[Rollout] | Dataset,
-        task: TaskSpec,
+        window: ReplayWindow,
+        samples: Sequence[Rollout] | Dataset,
         settings: Settings,
+        low_rank: LowRank,
         clock: Stopwatch,
         compute: Compute,
         rng: np.random.Generator,
     ) -> None:
-        self.task, self.settings, self.clock, self.compute = task, settings, clock, compute
+        self.window, self.task, self.settings, self.clock = window, window.task, settings, clock
+        self.low_rank, self.compute = low_rank, compute
         self.jitters: list[float] = []
-        self.from_dataset = isinstance(rollouts, Dataset)
-        if isinstance(rollouts, Dataset):
-            self.window, self.dataset, seen = state.window, rollouts, None
-        else:
-            self.window = state.extended_window(rollouts, task)
-            self.dataset = Dataset.of(self.window.rollouts)
-            seen = len(rollouts), sum(map(len, rollouts))
+        self.from_dataset = isinstance(samples, Dataset)
+        self.dataset = samples if isinstance(samples, Dataset) else Dataset.of(window.rollouts)
         self.size = len(self.dataset)
-        raw = np.concatenate(list(compute.map(ChunkRewards(task), self.dataset.chunks)))
-        self.all_rewards, self.reward_unit = standardise(raw)
-        self.sampled = some(np.arange(self.size), rng)
-        self.data = self.dataset.take(self.sampled)
-        self.rewards = self.all_rewards[self.sampled]
-        self.starts: FloatArray | None = None
-        if seen is None:
-            self.seen, self.actions = None, self.data.actions
+        read = list(compute.map(ChunkRewards(self.task), self.dataset.chunks))
+        self.all_rewards, self.reward_unit = standardise(
+            np.concatenate([rewards for rewards, _ in read])
+        )
+        self.in_memory = subsample(np.arange(self.size), low_rank.subsample, rng)
+        self.data = self.dataset.take(self.in_memory)
+        self.rewards = self.all_rewards[self.in_memory]
+        if isinstance(samples, Dataset):
+            self.seen = sum(rollouts for _, rollouts in read), self.size
+            self.actions = self.data.actions
         else:
-            acted = rollouts or self.window.rollouts
-            self.seen, self.actions = seen, np.concatenate([r.actions for r in acted])
+            self.seen = len(samples), sum(map(len, samples))
+            self.actions = np.concatenate([r.actions for r in samples or window.rollouts])
         clock.lap("sample")
 
-    def value_features(self, kernel: Kernel, rng: np.random.Generator) -> StreamedFeatures:
-        settings, data, place = self.settings, self.data, self.compute.to_device
-        if settings.features == "grid":
-            basis: Basis = RBFGrid.over(kernel.factors, data.points, settings.grid_size)[0]
+    def value_features(self, kernel: Kernel) -> StreamedFeatures:
+        value, data, to_device = self.settings.value, self.data, self.compute.to_device
+        if isinstance(value, Grid):
+            basis: Basis = RBFGrid.over(kernel.factors, data.points, value.size)[0]
         else:
-            cut = with_cuts(kernel, data, self.task, settings)
-            basis = self._basis(cut, data.points, settings.max_rank, rng)
-        sums = reduce(add, self.compute.map(StartFeatures(basis, place), self.dataset.chunks))
-        if self.seen is None:
-            self.seen = int(sums[-1]), self.size
-        changes = FeatureChanges(basis, sums[:-1] / int(sums[-1]), place)
-        own, observed = replace(changes, place=as_float).observed(data)
+            kernel = with_wrap_discontinuity(kernel, data, self.task, value)
+            basis = self._centres(kernel, data.points, value.max_rank, value.tolerance)
+        sums = reduce(add, self.compute.map(StartFeatures(basis, to_device), self.dataset.chunks))
+        changes = FeatureChanges(basis, sums[:-1] / int(sums[-1]), to_device)
+        own, observed = replace(changes, to_device=as_float).observed(data)
         self.clock.lap("basis")
         return StreamedFeatures(basis, own, observed, changes.start, changes)
 
@@ -135,143 +152,172 @@ class LowRankBatch:
         start: FloatArray | None,
         rng: np.random.Generator,
     ) -> StreamedExpectation:
-        found = self._transition_model(features, kernel, start, rng)
+        if self.settings.model == "dynamics":
+            found = self._dynamics(features, kernel, start, rng)
+        else:
+            found = self._embedding(features, kernel, start, rng)
         self.clock.lap("embedding")
         return found
 
-    def _transition_model(
+    def _dynamics(
         self,
         features: StreamedFeatures,
         kernel: Kernel,
         start: FloatArray | None,
         rng: np.random.Generator,
     ) -> StreamedExpectation:
+        """Features of V at the successor that a regression of the state's change predicts."""
         data, task, changes = self.data, self.task, features.changes
-        own, observed = features.own, features.observed
-        after = after_ends(observed, data.terminated[:, None].astype(np.float64), changes.start)
+        targets = DeltaStateTargets.of(data, task)
+        model, errors, x = self._regressed(
+            targets.targets(data, task),
+            lambda basis: DeltaStateSums(targets, basis, task, changes.to_device),
+            kernel,
+            start,
+            rng,
+        )
+        dynamics = Dynamics(targets, model.mean, errors.errors)
+        expected, errors = expected_features_of_samples(
+            data, features.basis, features.own, features.observed, features.start, dynamics, task
+        )
+        for_actions = partial(dynamics.expected_features, features.basis, features.start)
+        successors = PredictedSuccessors(changes, targets, model, task)
+        return StreamedExpectation(expected, errors, for_actions, x, dynamics, successors)
+
+    def _embedding(
+        self,
+        features: StreamedFeatures,
+        kernel: Kernel,
+        start: FloatArray | None,
+        rng: np.random.Generator,
+    ) -> StreamedExpectation:
+        """Eq. 4 on the features of successors, as printed or less those of the state itself."""
+        data, task, changes, own = self.data, self.task, features.changes, features.own
+        ended = data.terminated[:, None].astype(np.float64)
+        after = after_ends(features.observed, ended, features.start)
         if self.settings.model == "sample":
             return StreamedExpectation(after, None, None, None, None, ObservedSuccessors(changes))
-        inputs = state_actions(data, task)
-
-        def regressed(
-            targets: FloatArray, sums_in: Callable[[Basis], Callable[[Chunk], RegressionSums]]
-        ) -> tuple[FeatureRegression, LeaveOneOut, FloatArray]:
-            """A regression of all samples, with hyper-parameters from those in memory."""
-            fitted, regulariser, x = embedding_hyperparameters(
-                inputs, targets, kernel, task, start, rng
-            )
-            self.clock.lap("embedding fit")
-            basis = self._basis(fitted, inputs, self.settings.rank, rng)
-            sums = reduce(add, self.compute.map(sums_in(basis), self.dataset.chunks))
-            errors = FeatureRegression.leave_one_out(
-                basis.features(inputs), targets, regulariser, self.size / len(data)
-            )
-            return self._regression(basis, sums, regulariser), errors, x
-
-        if self.settings.model == "dynamics":
-            motion = Motion.of(data, task)
-            model, missed, x = regressed(
-                motion.targets(data, task),
-                lambda basis: MotionSums(motion, basis, task, changes.place),
-            )
-            dynamics = Dynamics(motion, model.mean, missed.errors)
-            expected, errors = observed_expectation(
-                data, features.basis, own, observed, changes.start, dynamics, task
-            )
-            of_actions = partial(dynamics.expected_features, features.basis, changes.start)
-            successors = PredictedSuccessors(changes, motion, model, task)
-            return StreamedExpectation(expected, errors, of_actions, x, dynamics, successors)
-        from_own = self.settings.model == "change"
-        origin = own if from_own else np.zeros_like(own)
-        model, errors, x = regressed(
-            after - origin, lambda basis: EmbeddingSums(changes, basis, task, from_own)
+        relative = self.settings.model == "change"
+        origin = own if relative else np.zeros_like(own)
+        model, errors, x = self._regressed(
+            after - origin,
+            lambda basis: EmbeddingSums(changes, basis, task, relative),
+            kernel,
+            start,
+            rng,
         )
         return StreamedExpectation(
-            origin + model.mean(inputs),
+            origin + model.mean(state_actions(data, task)),
             errors,
-            lambda rows, asked: origin[rows] + model.mean(asked),
+            lambda rows, inputs: origin[rows] + model.mean(inputs),
             x,
             None,
-            EmbeddedSuccessors(changes, model, task, from_own),
+            EmbeddedSuccessors(changes, model, task, relative),
         )
+
+    def _regressed(
+        self,
+        targets: FloatArray,
+        sums_in: Callable[[Basis], Callable[[Chunk], RegressionSums]],
+        kernel: Kernel,
+        start: FloatArray | None,
+        rng: np.random.Generator,
+    ) -> Regressed:
+        """A regression on states and actions, with hyper-parameters from the samples in memory.
+
+        Args:
+            targets: (m, r) of the samples in memory.
+            sums_in: what a chunk adds, given the features of states and actions.
+            kernel, start, rng: as of `transition_model`.
+        """
+        inputs = state_actions(self.data, self.task)
+        fitted, regulariser, x = embedding_hyperparameters(
+            inputs, targets, kernel, self.task, start, rng
+        )
+        self.clock.lap("embedding fit")
+        basis = self._centres(fitted, inputs, self.low_rank.rank)
+        sums = reduce(add, self.compute.map(sums_in(basis), self.dataset.chunks))
+        errors = FeatureRegression.leave_one_out(
+            basis.features(inputs), targets, regulariser, self.size / len(self.data)
+        )
+        return self._regression(basis, sums, regulariser), errors, x
 
     def solve_dual(
         self, features: StreamedFeatures, model: StreamedExpectation, eta_floor: float
     ) -> tuple[StreamedProblem, DualSolution]:
-        ridge, p = (
-            stationarity_ridge(self.settings, model.errors),
-            self.settings.restart_probability,
+        settings, p = self.settings, self.settings.restart_probability
+        ridge = stationarity_ridge(settings, model.errors)
+        restart = restart_features(
+            features.start, features.own.mean(axis=0), settings.exploring_starts
         )
-        restart = restart_features(features.start, features.own.mean(axis=0), self.settings)
         problem = StreamedProblem(
             dataset=self.dataset,
             rows=BellmanRows(model.successors, restart, p),
             rewards=self.all_rewards,
-            kl_bound=self.settings.kl_bound,
+            kl_bound=settings.kl_bound,
             ridge=ridge / self.size,
             eta_floor=eta_floor,
             compute=self.compute,
         )
         differences = feature_differences(features.own, model.expected, restart, p)
-        dual = coarse_to_fine(problem, ridge, differences, self.sampled)
+        dual = coarse_to_fine(problem, ridge, differences, self.in_memory, self.low_rank.subsample)
         self.clock.lap("dual")
         return problem, dual
 
     def fit_policy_to_data(
         self, p: FloatArray, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
     ) -> PolicyFit:
-        weights = np.where(self.size * p >= DROPPED_WEIGHT, p, 0.0) * effective_sample_size(p)
-        heard = some(np.flatnonzero(weights), rng)
-        part = self.dataset.take(heard)
-        samples = PolicySamples(
+        weights = np.where(self.size * p >= MIN_RELATIVE_WEIGHT, p, 0.0)
+        weights = weights * effective_sample_size(p)
+        rows = subsample(np.flatnonzero(weights), self.low_rank.subsample, rng)
+        part = self.dataset.take(rows)
+        targets = PolicyTargets(
             part.states,
             self.task.scaled(part.actions),
-            weights[heard],
+            weights[rows],
             float(weights.sum()),
-            np.zeros(len(heard)),
+            np.zeros(len(rows)),
         )
-        x = policy_hyperparameters(samples, kernel, self.settings, start, rng)
+        x = policy_hyperparameters(targets, kernel, self.settings.policy_fit, start, rng)
         self.clock.lap("policy fit")
-        centres = self._policy_centres(samples, kernel, x, rng)
+        centres = self._policy_centres(targets, kernel, x)
         sums_of = ChunkPolicySums(centres, self.task, self.compute.to_device)
         sums = reduce(
             add, self.compute.map(sums_of, self.dataset.chunks, self.dataset.split(weights))
         )
-        return self._sparse(centres, sums, x, float(np.exp(x[-1])))
+        return self._sparse_policy(centres, sums, x, float(np.exp(x[-1])))
 
     def fit_policy(
         self,
-        samples: PolicySamples,
+        targets: PolicyTargets,
         kernel: Kernel,
-        start: FloatArray,
+        start: FloatArray | None,
         rng: np.random.Generator,
-        narrower: float = 1.0,
+        std_scale: float = 1.0,
     ) -> PolicyFit:
-        x = policy_hyperparameters(samples, kernel, self.settings, start, rng)
-        centres = self._policy_centres(samples, kernel, x, rng)
-        weights, noise = drawn_noise(samples, float(np.exp(x[-1])))
-        sums = PolicySums.of(centres.features(samples.states), weights, samples.targets)
-        return self._sparse(centres, sums, x, noise, narrower)
+        x = policy_hyperparameters(targets, kernel, self.settings.policy_fit, start, rng)
+        centres = self._policy_centres(targets, kernel, x)
+        weights, noise = exploration_noise(targets, float(np.exp(x[-1])))
+        sums = PolicySums.of(centres.features(targets.states), weights, targets.targets)
+        return self._sparse_policy(centres, sums, x, noise, std_scale)
 
     def fit_reward(
         self, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
     ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]:
-        inputs, targets = (
-            state_actions(self.data, self.task),
-            (self.rewards - self.rewards.mean())[:, None],
-        )
-        cut = with_cuts(kernel, self.data, self.task, self.settings)
+        inputs = state_actions(self.data, self.task)
+        targets = (self.rewards - self.rewards.mean())[:, None]
+        kernel = with_wrap_discontinuity(kernel, self.data, self.task, self.settings.value)
         fitted, regulariser, x = embedding_hyperparameters(
-            inputs, targets, cut, self.task, start, rng
+            inputs, targets, kernel, self.task, start, rng
         )
-        basis = self._basis(fitted, inputs, self.settings.rank, rng)
+        basis = self._centres(fitted, inputs, self.low_rank.rank)
         sums = RegressionSums.of(basis.features(inputs), targets)
-        # scaled as if all samples were like those in memory
+        # scaled by the subsampling fraction, so that the subsample regularises like the full data
         model = self._regression(basis, sums, regulariser * len(self.data) / self.size)
         return model.mean, x
 
-    def of_data(self, p: FloatArray) -> FloatArray:
-        return p[self.sampled] / p[self.sampled].sum()
+    def weights_in_memory(self, p: FloatArray) -> FloatArray:
+        return p[self.in_memory] / p[self.in_memory].sum()
 
     def _regression(
         self, basis: Basis, sums: RegressionSums, regulariser: float
@@ -280,71 +326,75 @@ class LowRankBatch:
         self.jitters.append(model.jitter)
         return model
 
-    def _sparse(
+    def _sparse_policy(
         self,
         centres: RKHSBasis,
         sums: PolicySums,
         x: FloatArray,
         noise: float,
-        narrower: float = 1.0,
+        std_scale: float = 1.0,
     ) -> PolicyFit:
         policy = SparseGP.fit(self.task, centres, sums, signal=float(np.exp(x[-2])), noise=noise)
+        policy = policy.deflated(std_scale)
         self.clock.lap("policy")
-        return PolicyFit(policy.narrowed(narrower), x, len(policy.states))
+        return PolicyFit(policy, x, len(policy.states), policy.noise)
 
-    def _policy_centres(
-        self, samples: PolicySamples, kernel: Kernel, x: FloatArray, rng: np.random.Generator
-    ) -> RKHSBasis:
-        rank = min(self.settings.rank, MAX_SUPPORT)
-        return self._centres(kernel.with_lengthscales(np.exp(x[:-2])), samples.states, rank, rng)
-
-    def _basis(
-        self, kernel: Kernel, points: FloatArray, rank: int, rng: np.random.Generator
-    ) -> Basis:
-        """At most ``rank`` features of a kernel over points (m, d), as ``approximation`` asks."""
-        if self.settings.approximation == "fourier":
-            return FourierBasis.draw(kernel, points.shape[1], max_rank=rank, rng=rng)
-        return self._centres(kernel, points, rank, rng)
+    def _policy_centres(self, targets: PolicyTargets, kernel: Kernel, x: FloatArray) -> RKHSBasis:
+        rank = min(self.low_rank.rank, MAX_SUPPORT)
+        return self._centres(kernel.with_lengthscales(np.exp(x[:-2])), targets.states, rank)
 
     def _centres(
-        self, kernel: Kernel, points: FloatArray, rank: int, rng: np.random.Generator
+        self, kernel: Kernel, points: FloatArray, rank: int, tolerance: float = TOLERANCE
     ) -> RKHSBasis:
-        """The same with features that belong to some of the points."""
-        if self.settings.approximation == "uniform":
-            basis = RKHSBasis.uniform(kernel, points, max_rank=rank, rng=rng)
-        else:
-            tolerance = self.settings.basis_tolerance
-            basis, _ = RKHSBasis.fit(kernel, points, tolerance=tolerance, max_rank=rank)
+        """At most ``rank`` features of a kernel, centred at some of the points (m, d)."""
+        basis, _ = RKHSBasis.fit(kernel, points, tolerance=tolerance, max_rank=rank)
         self.jitters.append(basis.jitter)
         return basis
 
 
+def subsample(rows: IntArray, size: int, rng: np.random.Generator) -> IntArray:
+    """At most ``size`` of the row numbers, uniformly without replacement, in order."""
+    if len(rows) <= size:
+        return rows
+    return np.sort(rng.choice(rows, size, replace=False))
+
+
 def coarse_to_fine(
-    problem: StreamedProblem, ridge: float, differences: FloatArray, sampled: IntArray
+    problem: StreamedProblem,
+    ridge: float,
+    differences: FloatArray,
+    in_memory: IntArray,
+    subsample_size: int,
 ) -> DualSolution:
-    """The dual on the sample, in memory; then on more and more chunks, each from the last solution.
+    """The dual on the samples in memory, then on more and more chunks.
 
-    ``differences`` are the rows of B of the ``sampled`` ones.
+    Each solve starts from the solution before it.  A pass over all samples costs much more than one
+    over a few, so Newton's method should begin there near its end.
 
-    A pass over all samples costs much more than one over a few, so Newton's method is to begin
-    there near its end.
+    Args:
+        problem: of all samples.
+        ridge: rho times the number of samples.
+        differences: (m, r) rows of B of the samples in memory.
+        in_memory: (m,) their numbers.
+        subsample_size: largest number of samples in memory.
     """
+    n = len(problem.rewards)
     near = DualProblem(
-        rewards=problem.rewards[sampled],
+        rewards=problem.rewards[in_memory],
         differences=differences,
         kl_bound=problem.kl_bound,
-        ridge=ridge / min(GROWTH * len(sampled), len(problem.rewards)),
+        ridge=ridge / min(GROWTH * len(in_memory), n),
         eta_floor=problem.eta_floor,
     )
     dual = solve_dual(near)
-    if len(sampled) == len(problem.rewards):
+    if len(in_memory) == n:
         return dual
     stride = 1
-    while len(problem.rewards) >= 2 * GROWTH * stride * SAMPLE:
+    while n >= 2 * GROWTH * stride * subsample_size:
         stride *= GROWTH
     while stride:
         part = problem.part(slice(None, None, stride))
-        part = replace(part, ridge=ridge / min(GROWTH * len(part.rewards), len(problem.rewards)))
+        part = replace(part, ridge=ridge / min(GROWTH * len(part.rewards), n))
         dual = solve_dual(part, start=(dual.eta, dual.theta))
         stride //= GROWTH
     return dual

@@ -17,7 +17,7 @@ from scipy.sparse import coo_array, eye_array
 from scipy.sparse.linalg import spsolve
 
 from kreps.algorithms.dual import standardise
-from kreps.algorithms.state import LearnerState, Stopwatch
+from kreps.algorithms.state import LearnerState, Stopwatch, exact_transitions
 from kreps.data.rollout import Rollout
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
@@ -74,7 +74,8 @@ def update(
     """
     from scipy.spatial.distance import cdist  # 0.1 s that other methods need not wait
 
-    window, data = state.extended(rollouts, task)
+    window = state.append(rollouts)
+    data = exact_transitions(window)
     clock = Stopwatch()
     kernel = state_kernel(data, task, rng)
     points = kernel.embed(data.points)
@@ -100,7 +101,7 @@ def update(
         settings.noise_fraction,
         settings.noise_scale,
     )
-    new_state = state.after(rollouts, window, policy=policy)
+    new_state = state.after(len(rollouts), sum(map(len, rollouts)), window, policy=policy)
     return new_state, NPALPInfo(len(data), improvements, residual, clock.seconds)
 
 

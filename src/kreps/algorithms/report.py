@@ -59,7 +59,7 @@ class UpdateInfo:
     embedding_parameters: FloatArray | None
     policy_parameters: FloatArray
     noise: float
-    refused: bool | None
+    rejected: bool | None
     jitter: float
     seconds: dict[str, float]
 
@@ -80,6 +80,6 @@ class UpdateInfo:
             "ESS": f"{self.effective_samples:.0f}",
             "gap": f"{self.dual.gap:.0e}",
             "note": f"{_NOTES.get(self.dual.outcome, '')}"
-            + ("  refused: the policy before acts" if self.refused else "")
+            + ("  refused: the policy before acts" if self.rejected else "")
             + (f"  jitter {self.jitter:.0e}" if self.jitter else ""),
         }

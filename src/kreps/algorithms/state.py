@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from kreps.data.rollout import Rollout, Transitions
-from kreps.data.task import TaskSpec
-from kreps.data.window import Window, extended
+from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import LinearFunction
@@ -22,16 +21,16 @@ class LearnerState:
     """Everything that is carried from one update to the next: a checkpoint is exactly this.
 
     Attributes:
-        window: the roll-outs kept.
+        window: the replay window.
         iteration: updates made.
-        rollouts, steps: roll-outs and environment steps seen, forgotten ones included.
-        policy: that acts next: of the latest update, or the one before if that was refused.
-        value: V of the latest update, refused or not, if the method has one in an RKHS.
-        embedding_start, reward_start, policy_start: log hyper-parameters to start the next fits
-            from, if the method fits any.
+        rollouts, steps: rollouts and environment steps seen, forgotten ones included.
+        policy: the acting policy: of the latest update, or the previous one if that was rejected.
+        value: V of the latest update, rejected or not, if the method has one in an RKHS.
+        embedding_start, reward_start, policy_start: log hyper-parameters from which the next fits
+            of the transition model, the reward model and the policy start.
     """
 
-    window: Window
+    window: ReplayWindow
     iteration: int = 0
     rollouts: int = 0
     steps: int = 0
@@ -41,49 +40,43 @@ class LearnerState:
     reward_start: FloatArray | None = None
     policy_start: FloatArray | None = None
 
-    def extended(self, rollouts: Sequence[Rollout], task: TaskSpec) -> tuple[Window, Transitions]:
-        """The window with new roll-outs, and its transitions.
+    def append(self, rollouts: Sequence[Rollout]) -> ReplayWindow:
+        """The window with new rollouts.
 
         Raises:
-            DataError: no roll-outs at all, or some of another width than the task's.
-            ConfigurationError: more samples than an exact update can serve.
+            DataError: no rollouts at all, or some of another width than the task's.
         """
-        window = self.extended_window(rollouts, task)
-        data = window.transitions
-        if len(data) > MAX_SUPPORT:
-            raise ConfigurationError(
-                f"{len(data)} samples are kept, but the exact update takes at most {MAX_SUPPORT}, "
-                f"as it costs their cube; keep fewer than {len(window.rollouts)} roll-outs: set a "
-                'smaller window (or let KREPS approximate: approximation="auto")'
-            )
-        return window, data
-
-    def extended_window(self, rollouts: Sequence[Rollout], task: TaskSpec) -> Window:
-        """The window with new roll-outs.
-
-        Raises:
-            DataError: no roll-outs at all, or some of another width than the task's.
-        """
-        for rollout in rollouts:
-            rollout.check(task)
-        window = extended(self.window, rollouts, task)
+        window = self.window.append(rollouts)
         if not window.rollouts:
-            raise DataError("there is no roll-out to learn from; give at least one")
+            raise DataError("there is no rollout to learn from; give at least one")
         return window
 
-    def after(self, rollouts: Sequence[Rollout], window: Window, **learnt: Any) -> LearnerState:
-        """The state after an update from new ``rollouts``, with what was ``learnt`` replaced."""
-        return self.after_data(len(rollouts), sum(map(len, rollouts)), window=window, **learnt)
-
-    def after_data(self, rollouts: int, steps: int, **learnt: Any) -> LearnerState:
-        """The same after so many new roll-outs and steps, wherever they were."""
+    def after(self, rollouts: int, steps: int, window: ReplayWindow, **learnt: Any) -> LearnerState:
+        """The state after an update from so many new rollouts and steps, with what was learnt."""
         return replace(
             self,
             iteration=self.iteration + 1,
             rollouts=self.rollouts + rollouts,
             steps=self.steps + steps,
+            window=window,
             **learnt,
         )
+
+
+def exact_transitions(window: ReplayWindow) -> Transitions:
+    """The transitions of the window, for an update whose cost is cubic in their number.
+
+    Raises:
+        ConfigurationError: more than such an update can serve.
+    """
+    data = window.transitions
+    if len(data) > MAX_SUPPORT:
+        raise ConfigurationError(
+            f"{len(data)} samples are kept, but the exact update takes at most {MAX_SUPPORT}, as "
+            f"its cost is cubic; keep fewer than {len(window.rollouts)} rollouts by a smaller "
+            "window, or let KREPS approximate: low_rank=kreps.LowRank()"
+        )
+    return data
 
 
 class UpdateReport(Protocol):

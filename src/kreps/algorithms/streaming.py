@@ -22,23 +22,23 @@ from kreps.errors import DataError
 from kreps.kernels.arrays import Array, FloatArray, as_numpy, like, namespace, rows
 from kreps.kernels.basis import Basis
 from kreps.kernels.regression import FeatureRegression, RegressionSums
-from kreps.models.dynamics import Motion, after_ends, state_changes
+from kreps.models.dynamics import DeltaStateTargets, after_ends, state_changes
 from kreps.models.transition import state_actions
 from kreps.policies.sparse_gp import PolicySums
 
 Result = TypeVar("Result")
 
-Place = Callable[[FloatArray], Array]
+ToDevice = Callable[[FloatArray], Array]
 """Puts an array where the work is done."""
 
 
 @dataclass(frozen=True)
 class ChunkRewards:
-    """Rewards (n,) of a chunk, once its widths are known to be those of the task."""
+    """Rewards (n,) of a chunk and its number of rollouts, once its widths are those of the task."""
 
     task: TaskSpec
 
-    def __call__(self, chunk: Chunk) -> FloatArray:
+    def __call__(self, chunk: Chunk) -> tuple[FloatArray, int]:
         data = chunk.load()
         found = data.points.shape[1], data.actions.shape[1]
         wanted = self.task.observation_size, self.task.action_size
@@ -47,7 +47,7 @@ class ChunkRewards:
                 f"{getattr(chunk, 'path', 'a chunk')} has {found[0]} observation and {found[1]} "
                 f"action coordinates, the task {wanted[0]} and {wanted[1]}"
             )
-        return data.rewards
+        return data.rewards, len(data.start)
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class StartFeatures:
     """Sum of the features of a chunk's start states, (r,), and their number."""
 
     basis: Basis
-    place: Place
+    to_device: ToDevice
 
     def __call__(self, chunk: Chunk) -> FloatArray:
         """Both in one, (r + 1,)."""
         data = chunk.load()
-        phi = as_numpy(self.basis.features(self.place(data.points[data.start])))
+        phi = as_numpy(self.basis.features(self.to_device(data.points[data.start])))
         return np.append(phi.sum(axis=0), len(phi))
 
 
@@ -76,15 +76,15 @@ class FeatureChanges:
 
     basis: Basis
     start: FloatArray
-    place: Place
+    to_device: ToDevice
 
     def own(self, data: Transitions) -> Array:
         """``phi(s_i)``, (n, r)."""
-        return self.basis.features(self.place(data.states))
+        return self.basis.features(self.to_device(data.states))
 
     def observed(self, data: Transitions) -> tuple[Array, Array]:
         """``phi(s_i)`` and ``phi(s'_i)``, (n, r) each, whether or not the task ended there."""
-        points = self.basis.features(self.place(data.points))
+        points = self.basis.features(self.to_device(data.points))
         return rows(points, data.state), rows(points, data.successor)
 
     def both(self, data: Transitions) -> tuple[Array, Array]:
@@ -102,34 +102,34 @@ class EmbeddingSums:
         changes: features of V.
         embedded: features psi of states and applied actions.
         task: limits and scale of the actions.
-        from_own: whether successors are counted from the features of the state itself.
+        relative_to_state: whether successors are counted from the features of the state itself.
     """
 
     changes: FeatureChanges
     embedded: Basis
     task: TaskSpec
-    from_own: bool
+    relative_to_state: bool
 
     def __call__(self, chunk: Chunk) -> RegressionSums:
         data = chunk.load()
         own, after = self.changes.both(data)
-        psi = self.embedded.features(self.changes.place(state_actions(data, self.task)))
-        return RegressionSums.of(psi, after - own if self.from_own else after)
+        psi = self.embedded.features(self.changes.to_device(state_actions(data, self.task)))
+        return RegressionSums.of(psi, after - own if self.relative_to_state else after)
 
 
 @dataclass(frozen=True)
-class MotionSums:
+class DeltaStateSums:
     """What a chunk says of the regression of the dynamics."""
 
-    motion: Motion
+    delta_targets: DeltaStateTargets
     embedded: Basis
     task: TaskSpec
-    place: Place
+    to_device: ToDevice
 
     def __call__(self, chunk: Chunk) -> RegressionSums:
         data = chunk.load()
-        psi = self.embedded.features(self.place(state_actions(data, self.task)))
-        return RegressionSums.of(psi, self.place(self.motion.targets(data, self.task)))
+        psi = self.embedded.features(self.to_device(state_actions(data, self.task)))
+        return RegressionSums.of(psi, self.to_device(self.delta_targets.targets(data, self.task)))
 
 
 class Successors(Protocol):
@@ -158,18 +158,18 @@ class EmbeddedSuccessors:
         changes: features of V.
         model: the fitted embedding.
         task: limits and scale of the actions.
-        from_own: whether the model's successors are counted from the state's own features.
+        relative_to_state: whether the model's successors are counted from the state's own features.
     """
 
     changes: FeatureChanges
     model: FeatureRegression
     task: TaskSpec
-    from_own: bool
+    relative_to_state: bool
 
     def __call__(self, data: Transitions) -> tuple[Array, Array]:
         own = self.changes.own(data)
-        expected = self.model.mean(self.changes.place(state_actions(data, self.task)))
-        if self.from_own:
+        expected = self.model.mean(self.changes.to_device(state_actions(data, self.task)))
+        if self.relative_to_state:
             expected += own
         return own, expected
 
@@ -183,17 +183,17 @@ class PredictedSuccessors:
     """
 
     changes: FeatureChanges
-    motion: Motion
+    delta_targets: DeltaStateTargets
     model: FeatureRegression
     task: TaskSpec
 
     def __call__(self, data: Transitions) -> tuple[Array, Array]:
-        place = self.changes.place
+        to_device = self.changes.to_device
         own, observed = self.changes.observed(data)
-        inputs = place(state_actions(data, self.task))
-        targets = self.motion.trend(inputs) + self.model.mean(inputs)
-        away = place(data.states - state_changes(data, self.task))
-        mirrored = self.changes.basis.features(2.0 * self.motion.changes(targets) + away)
+        inputs = to_device(state_actions(data, self.task))
+        targets = self.delta_targets.linear_mean(inputs) + self.model.mean(inputs)
+        away = to_device(data.states - state_changes(data, self.task))
+        mirrored = self.changes.basis.features(2.0 * self.delta_targets.changes(targets) + away)
         ends = namespace(targets).clip(targets[:, -1:], 0.0, 1.0)
         return own, after_ends(0.5 * (observed + mirrored), ends, self.changes.start)
 
@@ -295,11 +295,11 @@ class ChunkPolicySums:
 
     basis: Basis
     task: TaskSpec
-    place: Place
+    to_device: ToDevice
 
     def __call__(self, chunk: Chunk, weights: FloatArray) -> PolicySums:
         data = chunk.load()
         kept = np.flatnonzero(weights)
-        z = self.basis.features(self.place(data.states[kept]))
+        z = self.basis.features(self.to_device(data.states[kept]))
         targets = self.task.scaled(data.actions[kept])
         return PolicySums.of(z, like(weights[kept], z), like(targets, z))

@@ -1,83 +1,93 @@
-"""One update of a learner: Algorithm 1, then the model-based step, then the report."""
+"""One update of KREPS: Algorithm 1, then the model-based step, then the report."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from kreps.algorithms.acceptance import least_temperature
+from kreps.algorithms.acceptance import temperature_floor
 from kreps.algorithms.dual import effective_sample_size
 from kreps.algorithms.exact import ExactBatch
 from kreps.algorithms.low_rank import LowRankBatch
-from kreps.algorithms.model_based import can_simulate, generates_samples, model_based_step
+from kreps.algorithms.model_based import (
+    generates_samples,
+    has_acceptance_test,
+    model_based_step,
+)
 from kreps.algorithms.report import UpdateInfo
 from kreps.algorithms.reps import Batch, Step, reps_step, stationarity_ridge
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
 from kreps.data.rollout import Rollout
-from kreps.data.task import TaskSpec
+from kreps.errors import ConfigurationError
 from kreps.settings import Settings
-
-EXACT_LIMIT = 3_000
 
 
 def update(
     state: LearnerState,
-    rollouts: Sequence[Rollout] | Dataset,
-    task: TaskSpec,
+    samples: Sequence[Rollout] | Dataset,
     settings: Settings,
     rng: np.random.Generator,
     compute: Compute,
 ) -> tuple[LearnerState, UpdateInfo]:
-    """One update from new roll-outs and those kept, or from a data set; nothing is modified."""
-    batch = batch_of(state, rollouts, task, settings, rng, compute)
-    judged = can_simulate(batch) and settings.judging_rollouts > 0
-    step = reps_step(batch, state, least_temperature(judged, settings), rng)
-    reward_start, refused = state.reward_start, None
+    """One update from new rollouts and those kept, or from a data set; nothing is modified.
+
+    Raises:
+        DataError: no rollouts at all, or some of another width than the task's.
+        ConfigurationError: more samples than an exact update can serve, and no low rank.
+    """
+    batch = batch_of(state, samples, settings, rng, compute)
+    step = reps_step(batch, state, temperature_floor(has_acceptance_test(batch), settings), rng)
+    reward_start, rejected = state.reward_start, None
     if generates_samples(batch):
-        step, reward_start, refused = model_based_step(batch, step, state, rng)
-    learnt = state.after_data(
+        step, reward_start, rejected = model_based_step(batch, step, state, rng)
+    new_state = state.after(
         *batch.seen,
         window=batch.window,
-        policy=state.policy if refused else step.policy.policy,
+        policy=state.policy if rejected else step.policy.policy,
         value=step.features.basis.function(batch.reward_unit * step.dual.theta),
         embedding_start=step.model.parameters,
         reward_start=reward_start,
         policy_start=step.policy.x,
     )
-    return learnt, report(batch, step, refused)
+    return new_state, report(batch, step, rejected)
 
 
 def batch_of(
     state: LearnerState,
-    rollouts: Sequence[Rollout] | Dataset,
-    task: TaskSpec,
+    samples: Sequence[Rollout] | Dataset,
     settings: Settings,
     rng: np.random.Generator,
     compute: Compute,
-) -> Batch:
-    """All samples exactly, or any number of them in low rank: what the settings ask for."""
-    clock = Stopwatch()
-    exact = settings.approximation == "exact"
-    if settings.approximation == "auto" and not isinstance(rollouts, Dataset):
-        window = state.extended_window(rollouts, task)
-        exact = sum(map(len, window.rollouts)) <= EXACT_LIMIT
-    if exact:
-        return ExactBatch(state, rollouts, task, settings, clock)
-    return LowRankBatch(state, rollouts, task, settings, clock, compute, rng)
+) -> Batch[Any, Any]:
+    """All samples exactly, or in low rank where ``settings.low_rank`` says so."""
+    clock, low_rank = Stopwatch(), settings.low_rank
+    if isinstance(samples, Dataset):
+        if low_rank is None:
+            raise ConfigurationError(
+                "low_rank = None, but a data set is learnt from in chunks; set "
+                "low_rank=kreps.LowRank(), or give a list of rollouts"
+            )
+        return LowRankBatch(state.window, samples, settings, low_rank, clock, compute, rng)
+    window = state.append(samples)
+    if low_rank is None or window.steps <= low_rank.above:
+        return ExactBatch(window, samples, settings, clock)
+    return LowRankBatch(window, samples, settings, low_rank, clock, compute, rng)
 
 
-def report(batch: Batch, step: Step, refused: bool | None) -> UpdateInfo:
-    """What is only told of an update."""
-    errors, settings, actions = step.model.errors, batch.settings, batch.actions
-    beyond = (actions < batch.task.action_low) | (actions > batch.task.action_high)
+def report(batch: Batch[Any, Any], step: Step, rejected: bool | None) -> UpdateInfo:
+    """What is only reported of an update."""
+    errors, actions, task = step.model.errors, batch.actions, batch.task
+    beyond = (actions < task.action_low) | (actions > task.action_high)
+    parameters = step.model.parameters
     return UpdateInfo(
         samples=batch.size,
-        kl_bound=settings.kl_bound,
+        kl_bound=batch.settings.kl_bound,
         eta_floor=step.problem.eta_floor,
-        ridge=stationarity_ridge(settings, errors),
+        ridge=stationarity_ridge(batch.settings, errors),
         model_error=float("nan") if errors is None else errors.relative,
         clipped=float(np.mean(beyond)),
         rank=step.problem.rank,
@@ -86,12 +96,10 @@ def report(batch: Batch, step: Step, refused: bool | None) -> UpdateInfo:
         effective_samples=effective_sample_size(step.dual.weights),
         support=step.policy.support,
         state_lengthscales=step.kernel.lengthscales,
-        embedding_parameters=None
-        if step.model.parameters is None
-        else np.exp(step.model.parameters),
+        embedding_parameters=None if parameters is None else np.exp(parameters),
         policy_parameters=np.exp(step.policy.x),
-        noise=step.policy.policy.noise,
-        refused=refused,
+        noise=step.policy.noise,
+        rejected=rejected,
         jitter=max(step.dual.jitter, *batch.jitters),
         seconds=batch.clock.seconds,
     )

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from kreps.algorithms.dual import standardise
-from kreps.algorithms.state import LearnerState, Stopwatch
+from kreps.algorithms.state import LearnerState, Stopwatch, exact_transitions
 from kreps.data.rollout import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError
@@ -22,7 +22,7 @@ from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.regression import KernelEmbedding
 from kreps.models.transition import fit_embedding, state_kernel, successor_features
 from kreps.policies.value_based import SoftmaxPolicy, soft_maximum
-from kreps.settings import GridValueIterationSettings, Settings, ValueIterationSettings
+from kreps.settings import RKHS, GridValueIterationSettings, ValueIterationSettings
 
 MAX_SWEEPS = 300
 """0.98^300 is 0.2 %: what is then left moves no action."""
@@ -30,7 +30,7 @@ MAX_SWEEPS = 300
 TOLERANCE = 1e-3
 """Of V between sweeps, up to a constant, in standard deviations of the reward."""
 
-BASIS = Settings()
+BASIS = RKHS()
 """Its basis is that of the features that the embedding is fitted to predict: as in REPS."""
 
 
@@ -81,11 +81,12 @@ def update(
     Raises:
         DataError: no roll-outs at all, or some of another width than the task's.
     """
-    window, data = state.extended(rollouts, task)
+    window = state.append(rollouts)
+    data = exact_transitions(window)
     clock = Stopwatch()
     kernel = state_kernel(data, task, rng)
     _, features = RKHSBasis.fit(
-        kernel, data.points, tolerance=BASIS.basis_tolerance, max_rank=BASIS.max_rank
+        kernel, data.points, tolerance=BASIS.tolerance, max_rank=BASIS.max_rank
     )
     clock.lap("basis")
     model, start = fit_embedding(
@@ -107,7 +108,9 @@ def update(
         candidates,
         unit * settings.temperature,
     )
-    new_state = state.after(rollouts, window, policy=policy, embedding_start=start)
+    new_state = state.after(
+        len(rollouts), sum(map(len, rollouts)), window, policy=policy, embedding_start=start
+    )
     info = ValueIterationInfo(len(data), sweeps, change, np.exp(start), clock.seconds)
     return new_state, info
 

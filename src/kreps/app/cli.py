@@ -28,15 +28,15 @@ from kreps.errors import ConfigurationError, EnvironmentFailure, KrepsError
 from kreps.experiments.claims import write_claims
 from kreps.experiments.executors import executor
 from kreps.experiments.figures import draw_features, write_figure
-from kreps.experiments.runner import figure_cells, run_cells
-from kreps.experiments.search import CANDIDATES, search_cells, write_search
-from kreps.experiments.specs import BEYOND, FIGURES, FIRST_SEED, PICTURES
+from kreps.experiments.runner import figure_trials, run_trials
+from kreps.experiments.search import CANDIDATES, search_trials, write_search
+from kreps.experiments.specs import EXTRA_EXPERIMENTS, FIGURES, FIRST_SEED, PICTURES
 from kreps.experiments.trials import name_of
 from kreps.learning.environment import Environment
 from kreps.learning.evaluate import EPISODES, STEPS
 from kreps.learning.learner import KREPS
 from kreps.learning.policy import load_policy, mean_difference
-from kreps.settings import settings_of
+from kreps.presets import settings_of
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -76,7 +76,7 @@ def options(
 @app.command(
     epilog="Examples:\n\n"
     "  kreps train kreps/SwingUp-v0 --iterations 20 --seed 0 --out runs/swing-up\n\n"
-    "  kreps train kreps/SwingUp-v0 --recipe paper --out runs/paper-like\n\n"
+    "  kreps train kreps/SwingUp-v0 --preset paper --out runs/paper-like\n\n"
     "  kreps train kreps/ImageSwingUp-v0 --iterations 15 --out runs/images\n\n"
     "  kreps train Pendulum-v1 --set kl_bound=0.5 --set window=60 --out runs/pendulum\n\n"
     "  kreps train my_robot.envs:Arm-v0 --periodic 0 --periodic 1 --out runs/arm"
@@ -88,7 +88,7 @@ def train(
     out: Annotated[Path, typer.Option(help="Folder for the run; must not hold one yet.")],
     iterations: Annotated[int, typer.Option(min=1, help="Policy updates to make.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same policy.")] = 0,
-    recipe: Annotated[
+    preset: Annotated[
         str,
         typer.Option(
             help="default; observed: one step on the actions taken; paper: close to the printed "
@@ -113,7 +113,7 @@ def train(
         environment=environment,
         iterations=iterations,
         seed=seed,
-        recipe=recipe,
+        preset=preset,
         settings=dict(_setting(text) for text in set_),
         periodic=periodic or None,
     )
@@ -307,7 +307,7 @@ def reproduce(
         str,
         typer.Argument(
             help=f"One of: {', '.join((*FIGURES, *PICTURES, 'all'))} (these); beyond the paper: "
-            f"{', '.join(BEYOND)}."
+            f"{', '.join(EXTRA_EXPERIMENTS)}."
         ),
     ],
     trials: Annotated[
@@ -329,7 +329,7 @@ def reproduce(
     Each cell (method x task x seed) is kept when it is done: stop at any time and call it again.
     Figures share cells, so [bold]all[/bold] costs less than its parts.
     """
-    known = (*FIGURES, *PICTURES, "all", *BEYOND)
+    known = (*FIGURES, *PICTURES, "all", *EXTRA_EXPERIMENTS)
     if figure not in known:
         raise ConfigurationError(f"figure {figure!r} is unknown; choose one of {', '.join(known)}")
     wanted = (*FIGURES, *PICTURES) if figure == "all" else (figure,)
@@ -337,13 +337,13 @@ def reproduce(
     if iterations is not None:
         command += f" --iterations {iterations}"
     cells = {
-        name: figure_cells(name, trials, iterations) for name in wanted if name not in PICTURES
+        name: figure_trials(name, trials, iterations) for name in wanted if name not in PICTURES
     }
     results = []
     if cells:
         with executor(workers, scheduler) as pool:
             every_cell = [cell for of_figure in cells.values() for cell in of_figure]
-            results = run_cells(every_cell, pool, out / "cells")
+            results = run_trials(every_cell, pool, out / "cells")
     for name in wanted:
         if name not in PICTURES:
             mine = {cell.name for cell in cells[name]}
@@ -378,11 +378,11 @@ def search(
         cell
         for task in tasks or CANDIDATES
         for method in CANDIDATES[task]
-        for of_candidate in search_cells(task, method)
+        for of_candidate in search_trials(task, method)
         for cell in of_candidate
     ]
     with executor(workers, scheduler) as pool:
-        results = run_cells(cells, pool, out / "cells" / "search")
+        results = run_trials(cells, pool, out / "cells" / "search")
     command = " ".join(["kreps search", *(tasks or ())])
     say(f"wrote {write_search(out / 'search.json', command, tasks or list(CANDIDATES), results)}")
 
@@ -419,11 +419,11 @@ def _setting(text: str) -> tuple[str, Any]:
 
 
 def _learner(config: RunConfig, env: Environment) -> KREPS:
-    settings_of(config.recipe, **config.settings)  # complains of anything that is no setting
+    settings_of(config.preset, **config.settings)  # complains of anything that is no setting
     return KREPS(
         env,
         seed=config.seed,
-        recipe=config.recipe,
+        preset=config.preset,
         periodic=config.periodic,
         **config.settings,
     )

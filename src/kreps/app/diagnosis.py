@@ -14,8 +14,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.special import stdtrit
 
-from kreps.algorithms.acceptance import ETA_FLOOR_JUDGED
-from kreps.algorithms.dual import ETA_LEAST, Outcome
+from kreps.algorithms.acceptance import ETA_FLOOR_WITH_ACCEPTANCE_TEST
+from kreps.algorithms.dual import MIN_ETA, Outcome
 from kreps.kernels.arrays import FloatArray
 
 Severity = Literal["limit", "note", "fine"]
@@ -202,7 +202,7 @@ def diagnose(
 def higher_floor(rows: Sequence[Row]) -> str:
     """The setting of twice the least temperature; of 0.2 where it is not known, or was none."""
     floor = latest(rows, "eta_floor")
-    return f"--set eta_floor={2.0 * floor if floor > 2.0 * ETA_LEAST else 0.2:.2g}"
+    return f"--set eta_floor={2.0 * floor if floor > 2.0 * MIN_ETA else 0.2:.2g}"
 
 
 def larger_ridge(rows: Sequence[Row]) -> str:
@@ -428,7 +428,9 @@ def step(rows: Sequence[Row]) -> Finding:
                 f"The updates use {share:.0%} of the KL bound ({bound:g}): eta is at its floor"
                 f"{least}, so that decides the step.",
             )
-        lower = "" if floor <= ETA_FLOOR_JUDGED else ", and only then a lower eta_floor"
+        lower = (
+            "" if floor <= ETA_FLOOR_WITH_ACCEPTANCE_TEST else ", and only then a lower eta_floor"
+        )
         return Finding(
             name,
             "note",

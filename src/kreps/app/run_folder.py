@@ -28,7 +28,7 @@ from kreps.errors import ConfigurationError, StorageError
 from kreps.learning.learner import KREPS, IterationReport
 from kreps.learning.progress import seconds_by_stage
 from kreps.learning.storage import save_policy, write_atomically
-from kreps.settings import Settings
+from kreps.settings import RKHS, Settings
 
 STAGES = (
     "rollouts",
@@ -96,14 +96,14 @@ class RunConfig:
     Attributes:
         environment: Gymnasium name.
         iterations: updates to make in all.
-        seed, recipe, settings: as given to `KREPS`; ``settings`` holds only what was changed.
+        seed, preset, settings: as given to `KREPS`; ``settings`` holds only what was changed.
         periodic: as given to `KREPS`.
     """
 
     environment: str
     iterations: int
     seed: int
-    recipe: str
+    preset: str
     settings: dict[str, Any]
     periodic: list[int] | None
 
@@ -239,8 +239,7 @@ class RunFolder:
 
 def rank_cap(settings: Settings) -> float:
     """Most features of V; NaN where their number is fixed: those of a grid, or Fourier features."""
-    fixed = settings.features == "grid" or settings.approximation == "fourier"
-    return math.nan if fixed else settings.max_rank
+    return settings.value.max_rank if isinstance(settings.value, RKHS) else math.nan
 
 
 def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
@@ -276,6 +275,6 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "max_rank": rank_cap(learner.settings),
         "ridge": info.ridge,
         "exploring": float(learner.exploring),
-        "refused": math.nan if info.refused is None else float(info.refused),
+        "refused": math.nan if info.rejected is None else float(info.rejected),
         **{seconds_column(stage): round(seconds.get(stage, 0.0), 5) for stage in STAGES},
     }

@@ -69,7 +69,7 @@ class ArrayChunk:
                     f"of a chunk of {len(each)}; leave that roll-out out"
                 )
         points, actions, rewards = values
-        return Transitions.laid_out(points, actions, rewards, self.lengths, self.terminated)
+        return Transitions.from_arrays(points, actions, rewards, self.lengths, self.terminated)
 
 
 @dataclass(frozen=True)
@@ -197,4 +197,4 @@ class Dataset:
             chosen = rows[cuts[i] : cuts[i + 1]] - self.offsets[i]
             if len(chosen):
                 parts.append(chunk.load().rows(chosen))
-        return Transitions.joined(parts)
+        return Transitions.concat(parts)

@@ -1,10 +1,4 @@
-"""What a learner explores with before there is a policy, for how long, and what it remembers of it.
-
-White noise averages out: what one step pushes the next one takes back, and a task whose states
-change slowly is never seen to change.  Noise with a power spectrum of ``1 / f^beta`` has slow parts
-as well: pink noise, beta = 1, as much in every octave, so that it needs no time scale (Eberhard et
-al. 2023 explore with it by default); red noise, beta = 2, is the random walk that goes farthest.
-"""
+"""Whether rewards depend on the state, or only on the cost of actions."""
 
 from __future__ import annotations
 
@@ -16,49 +10,43 @@ from kreps.data.rollout import Rollout
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 
-UNTOLD = 2e-7
-"""Part of the largest reward that is none: what 32-bit numbers lose in a sum or a product."""
+REWARD_RTOL = 2e-7
+"""Differences of rewards below this share of the largest magnitude count as rounding: it is what
+32-bit numbers lose in a sum or a product."""
 
 
-def tells_of_states(rollouts: Sequence[Rollout], task: TaskSpec) -> bool:
-    """Whether the rewards of some roll-outs depend on more than a price of the actions.
+def reward_depends_on_state(rollouts: Sequence[Rollout], task: TaskSpec) -> bool:
+    """Whether the rewards of some rollouts are more than a constant minus an action cost.
 
-    A goal that was never reached is a constant, and what else there is may be what actions cost,
-    quadratic as it mostly is.  Learnt from, it says that to do nothing is best.
+    Until some rollout reaches a sparse goal, the reward is a constant minus an action cost, and
+    learning from it only teaches inaction.  It is detected by a least-squares fit of the rewards by
+    a quadratic in the actions: the fit is exact, and no reward is above that of the zero action.
     """
     rewards = np.concatenate([rollout.rewards for rollout in rollouts])
-    least = UNTOLD * np.abs(rewards).max()
-    if np.ptp(rewards) <= least:
+    tolerance = REWARD_RTOL * np.abs(rewards).max()
+    if np.ptp(rewards) <= tolerance:
         return False
     actions = task.scaled(task.clip(np.concatenate([rollout.actions for rollout in rollouts])))
-    idle = task.scaled(task.clip(np.zeros((1, task.action_size))))
-    terms, of_idle = quadratic_terms(actions), quadratic_terms(idle)
-    if len(terms) <= terms.shape[1]:  # anything can be made of so many
+    zero = task.scaled(task.clip(np.zeros((1, task.action_size))))
+    terms, terms_of_zero = quadratic_terms(actions), quadratic_terms(zero)
+    if len(terms) <= terms.shape[1]:  # a quadratic fits so few rewards exactly, whatever they are
         return True
-    price = np.linalg.lstsq(terms, rewards)[0]
-    exact = np.abs(rewards - terms @ price).max() <= least
-    return not (exact and rewards.max() <= of_idle @ price + least)
+    coefficients = np.linalg.lstsq(terms, rewards)[0]
+    exact = np.abs(rewards - terms @ coefficients).max() <= tolerance
+    return not (exact and rewards.max() <= terms_of_zero @ coefficients + tolerance)
 
 
-def each_tells(rollouts: Sequence[Rollout], task: TaskSpec) -> bool:
-    """Whether the rewards of each roll-out tell of its states: if not, a goal is known from others.
-
-    Those too short to know are taken to tell.
-    """
-    return all(tells_alone(rollout, task) for rollout in rollouts if is_long_enough(rollout, task))
-
-
-def tells_alone(rollout: Rollout, task: TaskSpec) -> bool:
-    """Whether the rewards of one roll-out tell of states, and it is long enough to know."""
-    return is_long_enough(rollout, task) and tells_of_states([rollout], task)
+def is_informative(rollout: Rollout, task: TaskSpec) -> bool:
+    """Whether one rollout is long enough to decide it, and its reward depends on the state."""
+    return is_long_enough(rollout, task) and reward_depends_on_state([rollout], task)
 
 
 def is_long_enough(rollout: Rollout, task: TaskSpec) -> bool:
-    """Whether a price of the actions cannot explain just any rewards of a roll-out."""
+    """Whether a rollout has more steps than a quadratic in the actions has coefficients."""
     return len(rollout) > quadratic_terms(np.zeros((1, task.action_size))).shape[1]
 
 
 def quadratic_terms(actions: FloatArray) -> FloatArray:
-    """One, each coordinate of actions (n, da), and each product of two of them."""
+    """One, each coordinate of actions (n, da), and each product of two of them: (n, q)."""
     i, j = np.triu_indices(actions.shape[1])
     return np.column_stack([np.ones(len(actions)), actions, actions[:, i] * actions[:, j]])

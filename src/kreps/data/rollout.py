@@ -109,7 +109,7 @@ class Transitions:
     @classmethod
     def of(cls, rollouts: Sequence[Rollout]) -> Transitions:
         """Flatten at least one roll-out."""
-        return cls.laid_out(
+        return cls.from_arrays(
             np.concatenate([r.observations for r in rollouts]),
             np.concatenate([r.actions for r in rollouts]),
             np.concatenate([r.rewards for r in rollouts]),
@@ -118,7 +118,7 @@ class Transitions:
         )
 
     @classmethod
-    def laid_out(
+    def from_arrays(
         cls,
         points: FloatArray,
         actions: FloatArray,
@@ -136,7 +136,7 @@ class Transitions:
         return cls(points, state, state + 1, start, rollout, actions, rewards, terminated)
 
     @classmethod
-    def joined(cls, parts: Sequence[Transitions]) -> Transitions:
+    def concat(cls, parts: Sequence[Transitions]) -> Transitions:
         """All steps of at least one set of them, in order."""
         if len(parts) == 1:
             return parts[0]

@@ -23,7 +23,7 @@ import numpy as np
 
 from kreps.errors import StorageError
 from kreps.experiments.figures import named_rows
-from kreps.experiments.specs import ANY_STATE, FEATURES, KERNEL, NPALP, SAMPLE, VALUES
+from kreps.experiments.specs import FEATURES, GRID_VI, KERNEL, NPALP, SAMPLE, VALUES
 from kreps.experiments.tables import markdown
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.storage import write_atomically
@@ -136,7 +136,7 @@ CLAIMS = (
     Claim("Reaching: the same without exploration", _1A, KERNEL, VALUES, late_greedy),
     Claim(
         "Reaching: value iteration on a grid fails (ends worse than on-policy value iteration)",
-        *(_1A, VALUES, ANY_STATE, late_greedy),
+        *(_1A, VALUES, GRID_VI, late_greedy),
     ),
     Claim(
         "Swing-up: kernel REPS ends better than on-policy value iteration",
@@ -162,7 +162,7 @@ CLAIMS = (
     ),
     Claim(
         "Swing-up: value iteration on a grid works well (as well as kernel REPS)",
-        *(_1B, ANY_STATE, KERNEL, late_greedy, Kind.AS_GOOD),
+        *(_1B, GRID_VI, KERNEL, late_greedy, Kind.AS_GOOD),
     ),
     Claim(
         "Images: learning is a bit slower than from joint values",

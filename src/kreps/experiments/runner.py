@@ -18,19 +18,19 @@ from rich.progress import (
 
 from kreps.errors import CellFailure
 from kreps.experiments.search import tuned_options
-from kreps.experiments.specs import BEYOND, FIGURES, FIRST_SEED, TASKS
-from kreps.experiments.trials import Cell, cell_of, read_cell, run_cell, write_cell
+from kreps.experiments.specs import EXTRA_EXPERIMENTS, FIGURES, FIRST_SEED, TASKS
+from kreps.experiments.trials import Trial, read_cell, run_cell, trial_of, write_cell
 from kreps.learning.evaluate import EPISODES
 
 
-def figure_cells(figure: str, trials: int, iterations: int | None) -> list[Cell]:
+def figure_trials(figure: str, trials: int, iterations: int | None) -> list[Trial]:
     """The cells that a figure shows: ``trials`` seeds of each of its curves.
 
     They come seed by seed, so that partial results compare.
     """
     first = FIRST_SEED.get(figure, 0)
     return [
-        cell_of(
+        trial_of(
             task,
             method,
             seed,
@@ -39,11 +39,11 @@ def figure_cells(figure: str, trials: int, iterations: int | None) -> list[Cell]
             episodes=(TASKS[task].episodes, EPISODES),
         )
         for seed in range(first, first + trials)
-        for task, method in (FIGURES | BEYOND)[figure]
+        for task, method in (FIGURES | EXTRA_EXPERIMENTS)[figure]
     ]
 
 
-def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[dict[str, Any]]:
+def run_trials(cells: Sequence[Trial], executor: Executor, folder: Path) -> list[dict[str, Any]]:
     """The result of each cell; what is not in the folder yet is run, and kept when it is there.
 
     Cells of the same work under different names are run once.
@@ -67,7 +67,7 @@ def run_cells(cells: Sequence[Cell], executor: Executor, folder: Path) -> list[d
         failures: dict[str, Exception] = {}
         source = commit()  # the code that is about to run, whatever happens to the tree meanwhile
         done = {cell.work: result for cell in cells if (result := results[cell.name])}
-        same: dict[str, list[Cell]] = {}
+        same: dict[str, list[Trial]] = {}
         for cell in left:
             same.setdefault(cell.work, []).append(cell)
 

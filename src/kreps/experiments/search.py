@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from kreps.errors import StorageError
-from kreps.experiments.specs import ANY_STATE, FEATURES, KERNEL, METHODS, NPALP, SAMPLE, VALUES
+from kreps.experiments.specs import FEATURES, GRID_VI, KERNEL, METHODS, NPALP, SAMPLE, VALUES
 from kreps.experiments.tables import markdown
-from kreps.experiments.trials import Cell, cell_of, commits_of, name_of
+from kreps.experiments.trials import Trial, commits_of, name_of, trial_of
 from kreps.learning.storage import write_atomically
 
 SEEDS = (200, 201)
@@ -59,7 +59,7 @@ CANDIDATES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
         KERNEL: _REPS,
         SAMPLE: _REPS,
         VALUES: _VALUE_ITERATION,
-        ANY_STATE: _grids((4, 3), (3, 3), (3, 5), (3, 7), (4, 4), (5, 3)),
+        GRID_VI: _grids((4, 3), (3, 3), (3, 5), (3, 7), (4, 4), (5, 3)),
         NPALP: (
             {},
             {"lipschitz": 3.0},
@@ -81,7 +81,7 @@ CANDIDATES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
             {"grid_size": 15},
         ),
         VALUES: _VALUE_ITERATION,
-        ANY_STATE: _grids((15, 7), (10, 7), (20, 5), (25, 5), (20, 9), (30, 3)),
+        GRID_VI: _grids((15, 7), (10, 7), (20, 5), (25, 5), (20, 9), (30, 3)),
     },
     "images": {
         KERNEL: _REPS,
@@ -90,11 +90,11 @@ CANDIDATES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
 }
 
 
-def search_cells(task: str, method: str) -> list[list[Cell]]:
+def search_trials(task: str, method: str) -> list[list[Trial]]:
     """The cells of each candidate."""
     return [
         [
-            cell_of(
+            trial_of(
                 task,
                 method,
                 seed,
@@ -124,7 +124,7 @@ def outcome(task: str, method: str, results: Mapping[str, Mapping[str, Any]]) ->
     """
     scores = [
         [round(score(results[cell.name]["rows"]), 4) for cell in cells]
-        for cells in search_cells(task, method)
+        for cells in search_trials(task, method)
     ]
     best = int(np.argmax([np.mean(each) for each in scores]))
     candidates = CANDIDATES[task][method]

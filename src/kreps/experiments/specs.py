@@ -83,11 +83,11 @@ KERNEL = "kernel REPS"
 SAMPLE = "REPS, sample model"
 FEATURES = "REPS, RBF grid"
 VALUES = "value iteration"
-ANY_STATE = "value iteration on a grid (simulator set to any state)"
+GRID_VI = "value iteration on a grid (simulator set to any state)"
 NPALP = "NPALP"
 DEFAULT = "kreps (default)"
 PAPER = "paper-like"
-OBSERVED = "observed actions only"
+SINGLE_STEP = "observed actions only"
 LOW_RANK = "low rank"
 UNIFORM = "low rank, uniform"
 FOURIER = "low rank, Fourier"
@@ -99,11 +99,11 @@ METHODS: dict[str, Method] = {
     SAMPLE: Method("reps", {"recipe": "observed", "model": "sample"}),
     FEATURES: Method("reps", {"recipe": "observed", "features": "grid"}),
     VALUES: Method("value-iteration"),
-    ANY_STATE: Method("grid-value-iteration", once=True),
+    GRID_VI: Method("grid-value-iteration", once=True),
     NPALP: Method("npalp"),
     DEFAULT: Method("reps", tuned=False),
     PAPER: Method("reps", {"recipe": "paper"}, tuned=False),
-    OBSERVED: Method("reps", {"recipe": "observed"}, tuned=False),
+    SINGLE_STEP: Method("reps", {"recipe": "observed"}, tuned=False),
     LOW_RANK: Method("reps", {"recipe": "observed", "approximation": "pivoted"}, tuned=False),
     UNIFORM: Method("reps", {"recipe": "observed", "approximation": "uniform"}, tuned=False),
     FOURIER: Method("reps", {"recipe": "observed", "approximation": "fourier"}, tuned=False),
@@ -136,19 +136,19 @@ Curve = tuple[str, str]
 
 FIGURES: dict[str, tuple[Curve, ...]] = {
     # Feature-based REPS needs a grid over the state space: left out on reaching, as in the paper.
-    "figure-1a": tuple(("reaching", m) for m in (KERNEL, SAMPLE, NPALP, VALUES, ANY_STATE)),
+    "figure-1a": tuple(("reaching", m) for m in (KERNEL, SAMPLE, NPALP, VALUES, GRID_VI)),
     # NPALP is for deterministic tasks: left out on the swing-up, as in the paper.
-    "figure-1b": tuple(("swing-up", m) for m in (KERNEL, SAMPLE, FEATURES, VALUES, ANY_STATE)),
+    "figure-1b": tuple(("swing-up", m) for m in (KERNEL, SAMPLE, FEATURES, VALUES, GRID_VI)),
     "figure-2b": (("images", KERNEL), ("images", SAMPLE), ("swing-up", KERNEL)),
     # this learner beside the method of the paper
-    "swing-up": tuple(("swing-up", m) for m in (DEFAULT, OBSERVED, PAPER)),
+    "swing-up": tuple(("swing-up", m) for m in (DEFAULT, SINGLE_STEP, PAPER)),
 }
-BEYOND: dict[str, tuple[Curve, ...]] = {
+EXTRA_EXPERIMENTS: dict[str, tuple[Curve, ...]] = {
     "low-rank": (
-        *(("swing-up", m) for m in (OBSERVED, LOW_RANK, UNIFORM, FOURIER)),
-        *((task, m) for task in ("reaching", "images") for m in (OBSERVED, LOW_RANK)),
+        *(("swing-up", m) for m in (SINGLE_STEP, LOW_RANK, UNIFORM, FOURIER)),
+        *((task, m) for task in ("reaching", "images") for m in (SINGLE_STEP, LOW_RANK)),
     ),
-    "forgetting": tuple(("swing-up", m) for m in (OBSERVED, REMEMBERING)),
+    "forgetting": tuple(("swing-up", m) for m in (SINGLE_STEP, REMEMBERING)),
     # KREPS(env) and nothing else
     "untuned": tuple(
         (task, DEFAULT)

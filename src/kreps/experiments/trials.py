@@ -22,7 +22,7 @@ from kreps.settings import OnPolicySettings
 
 
 @dataclass(frozen=True)
-class Cell:
+class Trial:
     """What one worker is asked to do; made of plain values, so that it travels between processes.
 
     Attributes:
@@ -71,7 +71,7 @@ def _slug(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")
 
 
-def cell_of(
+def trial_of(
     task_name: str,
     method_name: str,
     seed: int,
@@ -80,13 +80,13 @@ def cell_of(
     iterations: int | None,
     episodes: tuple[int, int],
     label: str = "",
-) -> Cell:
+) -> Trial:
     """The cell of a task, a method and a seed, with ``options`` beside the method's own."""
     task, method = TASKS[task_name], METHODS[method_name]
     explores = issubclass(LEARNERS[method.learner].settings_type, OnPolicySettings)
     protocol = dict(task.exploration) if explores else {"ranges": task.ranges}
     wanted = task.iterations if iterations is None else iterations
-    return Cell(
+    return Trial(
         task=task_name,
         method=method_name,
         environment=task.environment,
@@ -99,7 +99,7 @@ def cell_of(
     )
 
 
-def run_cell(cell: Cell) -> dict[str, Any]:
+def run_cell(cell: Trial) -> dict[str, Any]:
     """Learn, and evaluate the policy after every iteration on random numbers of its own.
 
     Returns:
@@ -141,7 +141,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
     return {"cell": cell.description(), "rows": rows}
 
 
-def read_cell(cell: Cell, folder: Path) -> dict[str, Any] | None:
+def read_cell(cell: Trial, folder: Path) -> dict[str, Any] | None:
     """The result of this very cell if it is there and whole; None if it has to be run."""
     path = folder / f"{cell.name}.json"
     try:
@@ -157,7 +157,7 @@ def read_cell(cell: Cell, folder: Path) -> dict[str, Any] | None:
         ) from error
 
 
-def write_cell(cell: Cell, folder: Path, result: dict[str, Any]) -> None:
+def write_cell(cell: Trial, folder: Path, result: dict[str, Any]) -> None:
     path = folder / f"{cell.name}.json"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -168,7 +168,7 @@ def write_cell(cell: Cell, folder: Path, result: dict[str, Any]) -> None:
 
 def name_of(result: Mapping[str, Any]) -> str:
     """The name of the cell that a result is of."""
-    return Cell(**result["cell"]).name
+    return Trial(**result["cell"]).name
 
 
 def commits_of(results: Sequence[Mapping[str, Any]]) -> str:

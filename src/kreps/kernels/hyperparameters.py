@@ -91,7 +91,7 @@ class PolicyLoss:
     distances: FloatArray
     targets: FloatArray
     weights: FloatArray
-    within: FloatArray | float = 0.0
+    target_variance: FloatArray | float = 0.0
 
     def __call__(self, x: FloatArray) -> tuple[float, FloatArray]:
         """Value and gradient (g + 2,)."""
@@ -103,7 +103,7 @@ class PolicyLoss:
         kappa = np.diagonal(inverse)
         alpha = inverse @ self.targets
         e = alpha / kappa[:, None]
-        squares = np.einsum("ij,ij->i", e, e) + self.within
+        squares = np.einsum("ij,ij->i", e, e) + self.target_variance
         variance = 1.0 / kappa + noise * (1.0 - 1.0 / self.weights)
         value = share @ (0.5 * actions * np.log(2.0 * np.pi * variance) + 0.5 * squares / variance)
         by_variance = 0.5 * share * (actions - squares / variance) / variance

@@ -57,7 +57,7 @@ class Periodic:
 
 
 @dataclass(frozen=True)
-class CutAngle:
+class WrapAngle:
     """``exp(-|x - y|^2 / (2 l^2))`` of an angle by its number, from ``begin`` to a turn later.
 
     Beside a periodic factor of the same angle it tells the two sides of the cut apart, where the
@@ -126,9 +126,9 @@ def factors_of(
     )
 
 
-def cut_factors(angles: Sequence[int], begins: Sequence[float]) -> tuple[CutAngle, ...]:
+def wrap_factors(angles: Sequence[int], begins: Sequence[float]) -> tuple[WrapAngle, ...]:
     """One factor for each column of angles, cut where its numbers begin."""
-    return tuple(CutAngle((i,), float(begin)) for i, begin in zip(angles, begins, strict=True))
+    return tuple(WrapAngle((i,), float(begin)) for i, begin in zip(angles, begins, strict=True))
 
 
 @dataclass(frozen=True)

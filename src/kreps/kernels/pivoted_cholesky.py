@@ -33,13 +33,13 @@ class PivotedCholesky:
     residual: float
 
 
-POOL = 256
+CANDIDATES = 256
 """Candidates of a round of `pivoted_cholesky`."""
 
-WORTH = 0.5
+PIVOT_RATIO = 0.5
 """Least residual of a candidate, as a share of the largest."""
 
-STILL_WORTH = 0.3
+PIVOT_RATIO_IN_BLOCK = 0.3
 """Least residual of a candidate once the earlier ones of its round are accounted for; likewise."""
 
 
@@ -79,9 +79,9 @@ def pivoted_cholesky(
     pivots = np.empty(max_rank, dtype=np.intp)
     rank = 0
     while rank < max_rank and (top := float(left.max())) > tolerance:
-        candidates = np.flatnonzero(left >= max(WORTH * top, tolerance))
-        if len(candidates) > POOL:
-            spread = np.linspace(0, len(candidates) - 1, POOL).astype(np.intp)
+        candidates = np.flatnonzero(left >= max(PIVOT_RATIO * top, tolerance))
+        if len(candidates) > CANDIDATES:
+            spread = np.linspace(0, len(candidates) - 1, CANDIDATES).astype(np.intp)
             candidates = candidates[spread]
         known = columns[candidates, :rank]
         small = entries(candidates, candidates) - known @ known.T
@@ -94,7 +94,7 @@ def pivoted_cholesky(
         # A candidate close to an earlier one is left for a later round, where a better row
         # than it may have turned up: this keeps the trace near that of one-by-one pivoting.
         sizes = np.diagonal(local)[:kept] ** 2
-        kept = max(1, int(np.argmin(np.append(sizes > STILL_WORTH * top, False))))
+        kept = max(1, int(np.argmin(np.append(sizes > PIVOT_RATIO_IN_BLOCK * top, False))))
         kept = min(kept, block, max_rank - rank)
         order = order[:kept] - 1
         chosen = candidates[order]

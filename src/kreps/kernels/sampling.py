@@ -13,14 +13,14 @@ FIT_SAMPLE = 200
 """Samples on which hyper-parameters are fitted: the cost is cubic, the estimate no better."""
 
 
-def random_rows(n: int, rng: np.random.Generator) -> IntArray:
+def uniform_subsample(n: int, rng: np.random.Generator) -> IntArray:
     """At most `FIT_SAMPLE` row numbers out of n, in order."""
     if n <= FIT_SAMPLE:
         return np.arange(n)
     return np.sort(rng.choice(n, FIT_SAMPLE, replace=False))
 
 
-def telling_rows(squares: FloatArray, rng: np.random.Generator) -> tuple[IntArray, FloatArray]:
+def pps_subsample(squares: FloatArray, rng: np.random.Generator) -> tuple[IntArray, FloatArray]:
     """At most `FIT_SAMPLE` row numbers, in order, and how many of all rows each stands for, (m,).
 
     A goal that is seldom reached, or an end, is in a handful of many samples, and a fit that sees
@@ -38,7 +38,7 @@ def telling_rows(squares: FloatArray, rng: np.random.Generator) -> tuple[IntArra
     equal = np.full(n, 1.0 / n)
     total = float(squares.sum())
     share = 0.5 * equal + 0.5 * (squares / total if total > 0.0 else equal)
-    chance = inclusion(share, FIT_SAMPLE)
+    chance = inclusion_probabilities(share, FIT_SAMPLE)
     # systematic, in random order: one in each unit of the summed chances, none of which exceeds one
     order = rng.permutation(n)
     marks = rng.uniform() + np.arange(FIT_SAMPLE)
@@ -47,7 +47,7 @@ def telling_rows(squares: FloatArray, rng: np.random.Generator) -> tuple[IntArra
     return rows, 1.0 / chance[rows]
 
 
-def evidence(squares: FloatArray, weights: FloatArray) -> float:
+def effective_target_count(squares: FloatArray, weights: FloatArray) -> float:
     """How many errors of equal size those of all rows are worth: an effective sample size.
 
     Errors are taken to be as large as what is to be predicted.  If that is one goal among rows of
@@ -65,7 +65,7 @@ def evidence(squares: FloatArray, weights: FloatArray) -> float:
     return float(mass.sum()) ** 2 / float(mass @ (squares / most))
 
 
-def inclusion(share: FloatArray, count: int) -> FloatArray:
+def inclusion_probabilities(share: FloatArray, count: int) -> FloatArray:
     """Chances (n,) that add up to ``count`` < n: ``share`` times a number, but none above one."""
     chance = count * share
     certain = np.zeros(len(share), dtype=bool)
@@ -76,7 +76,7 @@ def inclusion(share: FloatArray, count: int) -> FloatArray:
     return chance
 
 
-def resample(p: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
+def systematic_resampling(p: FloatArray, count: int, rng: np.random.Generator) -> IntArray:
     """``count`` sample numbers in order, i at least ``floor(count p_i)`` times (systematic)."""
     places = (np.arange(count) + rng.uniform()) / count
     return np.minimum(np.searchsorted(np.cumsum(p), places * p.sum()), len(p) - 1)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
@@ -19,10 +19,9 @@ from kreps.algorithms.state import LearnerState, UpdateReport
 from kreps.algorithms.update import update as reps_update
 from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
-from kreps.data.rewards import tells_of_states
 from kreps.data.rollout import Rollout
 from kreps.data.task import TaskSpec
-from kreps.data.window import Window, latest
+from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import LinearFunction
@@ -34,6 +33,7 @@ from kreps.learning.policy import Policy
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 from kreps.policies.exploration import PINK, RED, WHITE, BangBang, Gaussian
+from kreps.presets import changed, flat, settings_of
 from kreps.seeding import Purpose, generator
 from kreps.settings import (
     GridValueIterationSettings,
@@ -42,8 +42,6 @@ from kreps.settings import (
     OnPolicySettings,
     Settings,
     ValueIterationSettings,
-    changed,
-    settings_of,
 )
 
 
@@ -137,7 +135,7 @@ class Learner(Generic[MethodSettings]):
                     )
         self.settings = self._settings(settings)
         self.threads = None if threads is None else max(1, _whole("threads", threads))
-        self.state = LearnerState(Window(self.settings.window))
+        self.state = LearnerState(ReplayWindow(self.task, self.settings.window))
         self._policy: Policy | None = None
 
     def _settings(self, changes: dict[str, Any]) -> MethodSettings:
@@ -257,15 +255,16 @@ class Learner(Generic[MethodSettings]):
                 )
         if not rollouts:
             raise DataError("there is no new roll-out to learn from; give at least one")
+        return self._update(rollouts)
+
+    def _update(self, samples: Any) -> UpdateReport:
         rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
         with blas_threads(self.threads):
-            self.state, info = self._updated(rollouts, rng)
+            self.state, info = self._updated(samples, rng)
         return info
 
-    def _updated(
-        self, rollouts: list[Rollout], rng: np.random.Generator
-    ) -> tuple[LearnerState, UpdateReport]:
-        return type(self).algorithm(self.state, rollouts, self.task, self.settings, rng)
+    def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:
+        return type(self).algorithm(self.state, samples, self.task, self.settings, rng)
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
         """The next iteration's data."""
@@ -298,7 +297,7 @@ class Learner(Generic[MethodSettings]):
             ConfigurationError: the environment is not of the shape that was learnt in.
         """
         state, task, settings, seed = storage.load_checkpoint(path, cls.method, cls.settings_type)
-        learner = cls(task, seed=seed, **asdict(settings))
+        learner = cls(task, seed=seed, **flat(settings))
         if env is not None:
             learner.env, _ = without_restarts(env)
             found = task_of(env, task.periodic)
@@ -330,7 +329,7 @@ class OnPolicyLearner(Learner[OnPolicy]):
             seed=self.seed,
             iteration=self.state.iteration,
             restart_probability=self.settings.restart_probability,
-            stratified=self.settings.restarts == "stratified",
+            stratified=self.settings.rollout_lengths == "stratified",
             exponent=exponent,
             on_rollout=on_rollout,
         )
@@ -342,8 +341,8 @@ class OnPolicyLearner(Learner[OnPolicy]):
 
     @property
     def exploring(self) -> bool:
-        newest = latest(self.state.window)
-        return bool(newest) and not tells_of_states(newest, self.task)
+        window = self.state.window
+        return bool(window.rollouts) and not window.newest_depend_on_state
 
     def _acting(self) -> tuple[StochasticPolicy, float]:
         """The policy of the next roll-outs, and the exponent of its noise's spectrum."""
@@ -351,10 +350,10 @@ class OnPolicyLearner(Learner[OnPolicy]):
             return BangBang(self.task), RED
         if self.state.policy is not None:
             return self.state.policy, WHITE
-        if self.settings.exploration == "bang-bang":
+        if self.settings.exploration.noise == "bang-bang":
             return BangBang(self.task), WHITE
-        gaussian = Gaussian(self.task, self.settings.exploration_scale)
-        return gaussian, PINK if self.settings.exploration == "pink" else WHITE
+        gaussian = Gaussian(self.task, self.settings.exploration.scale)
+        return gaussian, PINK if self.settings.exploration.noise == "pink" else WHITE
 
 
 class KREPS(OnPolicyLearner[Settings]):
@@ -381,18 +380,18 @@ class KREPS(OnPolicyLearner[Settings]):
         env: Environment | TaskSpec,
         *,
         seed: int = 0,
-        recipe: str | Settings = "default",
+        preset: str | Settings = "model_based",
         periodic: Sequence[int] | None = None,
         threads: int | None = 1,
         compute: Compute | None = None,
         **settings: Any,
     ) -> None:
-        self._recipe = recipe
+        self._preset = preset
         self.compute = compute or Compute()
         super().__init__(env, seed=seed, periodic=periodic, threads=threads, **settings)
 
     def _settings(self, changes: dict[str, Any]) -> Settings:
-        return settings_of(self._recipe, **changes)
+        return settings_of(self._preset, **changes)
 
     def update(self, rollouts: Iterable[Rollout] | Dataset) -> UpdateReport:
         """One update from roll-outs collected anywhere; those kept from before count too.
@@ -412,20 +411,10 @@ class KREPS(OnPolicyLearner[Settings]):
         """
         if not isinstance(rollouts, Dataset):
             return super().update(rollouts)
-        if self.settings.approximation == "exact":
-            raise ConfigurationError(
-                'approximation = "exact", but a data set is learnt from in chunks; choose '
-                'another, such as "pivoted", or give a list of roll-outs'
-            )
-        rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
-        with blas_threads(self.threads):
-            self.state, info = self._updated(rollouts, rng)
-        return info
+        return self._update(rollouts)
 
-    def _updated(
-        self, rollouts: list[Rollout], rng: np.random.Generator
-    ) -> tuple[LearnerState, UpdateReport]:
-        return reps_update(self.state, rollouts, self.task, self.settings, rng, self.compute)
+    def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:
+        return reps_update(self.state, samples, self.settings, rng, self.compute)
 
     @property
     def value_function(self) -> LinearFunction:

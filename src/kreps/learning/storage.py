@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,17 +23,19 @@ from kreps.algorithms.state import LearnerState
 from kreps.data.dataset import Dataset
 from kreps.data.rollout import Rollout, Transitions
 from kreps.data.task import TaskSpec, is_sane
-from kreps.data.window import Window
+from kreps.data.window import ReplayWindow
 from kreps.errors import KrepsError, StorageError
 from kreps.kernels.arrays import FloatArray, IntArray
 from kreps.kernels.basis import FourierExpansion, KernelExpansion, LinearFunction
-from kreps.kernels.kernel import CutAngle, Kernel, cut_factors
+from kreps.kernels.kernel import Kernel, WrapAngle, wrap_factors
 from kreps.kernels.threads import blas_threads
+from kreps.legacy import checkpoint_settings
 from kreps.policies.base import LearntPolicy
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT, CostSensitiveGP
 from kreps.policies.sparse_gp import SparseGP
 from kreps.policies.value_based import LipschitzPolicy, SoftmaxPolicy
-from kreps.settings import AnySettings, LearnerSettings
+from kreps.presets import AnySettings, changed, flat
+from kreps.settings import LearnerSettings
 
 VERSION = 2
 MAX_FILE_BYTES = 2**30
@@ -76,22 +78,6 @@ CHECKPOINT_ARRAYS = (
         "start.reward",
     }
 )
-ADDED_LATER: dict[str, dict[str, Any]] = {
-    "reps": {
-        "imagined": 0,
-        "exploring_starts": 0.0,
-        "imagined_noise": 1.0,
-        "imagined_rollouts": 0.0,
-        "judging_rollouts": 0,
-        "restarts": "independent",
-        "optimism": 0.0,
-        "angles": "round",
-    }
-}
-"""Settings by method that earlier checkpoints have not, at the values that mean what these did.
-
-An ``optimism`` that is there is taken as it is, though before it meant a reward that is paid once:
-what is left of it after a few updates is nothing either way."""
 
 ARRAYS = {"policy": POLICY_ARRAYS, "rollouts": ROLLOUT_ARRAYS, "checkpoint": CHECKPOINT_ARRAYS}
 
@@ -106,16 +92,16 @@ def write_atomically(path: Path, content: bytes) -> None:
     """Replace the file as a whole; the directory must exist."""
     if not path.name or "\0" in str(path):
         raise StorageError(f"{str(path)!r} does not name a file")
-    beside = path.with_name(f".{path.name}.part")
+    concat = path.with_name(f".{path.name}.part")
     try:
-        with open(beside, "wb") as file:
+        with open(concat, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        beside.replace(path)
+        concat.replace(path)
     except OSError as error:
         with suppress(OSError):
-            beside.unlink()
+            concat.unlink()
         raise StorageError(
             f"cannot write {path}: {error}; check the folder and its space"
         ) from error
@@ -279,7 +265,7 @@ def _task_of(header: Header) -> TaskSpec:
 def _state_kernel(task: TaskSpec, lengthscales: FloatArray, cuts: Sequence[float] = ()) -> Kernel:
     if not ((lengthscales > 1e-50) & (lengthscales < 1e50)).all():
         raise StorageError(f"lengthscales {lengthscales} are not all between 1e-50 and 1e50")
-    cut = cut_factors(task.periodic[: len(cuts)], cuts)  # all of them, or none
+    cut = wrap_factors(task.periodic[: len(cuts)], cuts)  # all of them, or none
     return Kernel((*task.state_factors, *cut), lengthscales)
 
 
@@ -468,7 +454,7 @@ def _policy_of(tensors: Tensors, task: TaskSpec, kind: str) -> LearntPolicy:
 
 def _value_parts(value: LinearFunction) -> Tensors:
     common = {"value.lengthscales": value.kernel.lengthscales}
-    cuts = [factor.begin for factor in value.kernel.factors if isinstance(factor, CutAngle)]
+    cuts = [factor.begin for factor in value.kernel.factors if isinstance(factor, WrapAngle)]
     if cuts:
         common["value.cuts"] = np.array(cuts)
     if isinstance(value, FourierExpansion):
@@ -593,7 +579,7 @@ class RolloutFile:
                 f"{self.path} holds {found} samples, but had {self.samples} when the folder "
                 "was opened; open it again"
             )
-        return Transitions.laid_out(
+        return Transitions.from_arrays(
             t["window.observations"],
             t["window.actions"],
             t["window.rewards"],
@@ -658,7 +644,7 @@ def save_checkpoint(
     header: Header = {
         "method": method,
         "task": _task_header(task),
-        "settings": asdict(settings),
+        "settings": flat(settings),
         "seed": seed,
         "iteration": state.iteration,
         "rollouts": state.rollouts,
@@ -696,16 +682,16 @@ def load_checkpoint(
         )
     try:
         task = _task_of(header)
-        settings = settings_type(**{**ADDED_LATER.get(method, {}), **header["settings"]})
+        settings = changed(settings_type(), checkpoint_settings(header["settings"], method))
         counts = [header[name] for name in ("seed", "iteration", "rollouts", "steps")]
         if not all(type(count) is int and count >= 0 for count in counts):
             raise StorageError(f"seed and counts {counts} are not all whole numbers >= 0")
         seed, iteration, rollouts_seen, steps = counts
-        window = Window(settings.window)
+        window = ReplayWindow(task, settings.window)
         # a learner that has seen nothing but data sets has no roll-outs
         if ROLLOUT_ARRAYS & tensors.keys() or (iteration > 0 and method != "reps"):
             rollouts = _rollouts_of(tensors, task.observation_size, task.action_size)
-            window = window.extend(rollouts)
+            window = window.append(rollouts)
         learnt, g = iteration > 0, task.factor_count
         cut_count = len(tensors.get("value.cuts", ()))  # the reward's kernel has V's cuts
         if learnt and header["policy"] not in POLICIES_OF_METHOD[method]:

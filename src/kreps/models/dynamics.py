@@ -44,10 +44,10 @@ def state_changes(data: Transitions, task: TaskSpec) -> FloatArray:
 ROUNDING = 1e-12
 """Changes below this share of a coordinate's size are none: its rounding is not to be learnt."""
 
-TREND_SAMPLES = 10
+SAMPLES_PER_COEFFICIENT = 10
 """Least number of samples for each coefficient of a trend; with fewer there is none."""
 
-TREND_RIDGE = 1e-6
+LINEAR_RIDGE = 1e-6
 """Of a trend's least squares, a sample, for states of unit variance: as good as none."""
 
 ACTION_RIDGE = 1.0
@@ -56,7 +56,7 @@ nothing of how a whole range of them would act, which is what will be asked."""
 
 
 @dataclass(frozen=True)
-class Motion:
+class DeltaStateTargets:
     """What is regressed: changes of state as numbers of order one, less a trend; and real ends.
 
     A kernel regression fades to nothing far from the data and follows a slope only where samples
@@ -69,28 +69,28 @@ class Motion:
         slopes: (1 + ds + da, ds + 1) of the trend: its constant, then those of states and actions.
     """
 
-    unit: FloatArray
+    scale: FloatArray
     slopes: FloatArray
 
     @classmethod
-    def of(cls, data: Transitions, task: TaskSpec) -> Motion:
-        unit = np.ones(task.observation_size)
+    def of(cls, data: Transitions, task: TaskSpec) -> DeltaStateTargets:
+        scale = np.ones(task.observation_size)
         changes = state_changes(data, task)
         squares = np.mean(changes**2, axis=0)
         for factor in task.state_factors:
             dims = list(factor.dims)
             size = np.sqrt(np.mean(squares[dims]))
             if size > ROUNDING * np.abs(data.points[:, dims]).max():
-                unit[dims] = size
-        slopes = linear_trend(state_actions(data, task), changes / unit, task)
-        return cls(unit, np.column_stack([slopes, np.zeros(len(slopes))]))
+                scale[dims] = size
+        slopes = linear_least_squares(state_actions(data, task), changes / scale, task)
+        return cls(scale, np.column_stack([slopes, np.zeros(len(slopes))]))
 
     def targets(self, data: Transitions, task: TaskSpec) -> FloatArray:
         """What is regressed of n transitions, (n, ds + 1)."""
-        whole = np.column_stack([state_changes(data, task) / self.unit, data.terminated])
-        return whole - self.trend(state_actions(data, task))
+        whole = np.column_stack([state_changes(data, task) / self.scale, data.terminated])
+        return whole - self.linear_mean(state_actions(data, task))
 
-    def trend(self, inputs: Array) -> Array:
+    def linear_mean(self, inputs: Array) -> Array:
         """What is not regressed, (n, ds + 1), of states and applied actions (n, ds + da)."""
         used = np.flatnonzero(self.slopes[1:].any(axis=1))  # of 800 pixels mostly none
         slopes = self.slopes[1:][used]
@@ -98,26 +98,26 @@ class Motion:
 
     def changes(self, targets: Array) -> Array:
         """Changes of state (n, ds) of targets and trend together (n, ds + 1)."""
-        return targets[:, :-1] * like(self.unit, targets)
+        return targets[:, :-1] * like(self.scale, targets)
 
 
-def linear_trend(inputs: FloatArray, targets: FloatArray, task: TaskSpec) -> FloatArray:
+def linear_least_squares(inputs: FloatArray, targets: FloatArray, task: TaskSpec) -> FloatArray:
     """Constant and slopes (1 + d, k) of targets (n, k) as linear functions of inputs (n, d).
 
     Zero for angles and for what never changes, and all of them where there are too few samples.
     """
     slopes = np.zeros((1 + inputs.shape[1], targets.shape[1]))
-    unit = inputs.std(axis=0)
-    used = unit > ROUNDING * np.abs(inputs).max(axis=0)
+    scale = inputs.std(axis=0)
+    used = scale > ROUNDING * np.abs(inputs).max(axis=0)
     used[list(task.periodic)] = False
-    if len(inputs) < TREND_SAMPLES * (1 + np.count_nonzero(used)):
+    if len(inputs) < SAMPLES_PER_COEFFICIENT * (1 + np.count_nonzero(used)):
         return slopes
-    ridge = np.full(inputs.shape[1], TREND_RIDGE * len(inputs))
-    unit[task.observation_size :], ridge[task.observation_size :] = 1.0, ACTION_RIDGE
+    ridge = np.full(inputs.shape[1], LINEAR_RIDGE * len(inputs))
+    scale[task.observation_size :], ridge[task.observation_size :] = 1.0, ACTION_RIDGE
     centre = inputs[:, used].mean(axis=0)
-    z = (inputs[:, used] - centre) / unit[used]
+    z = (inputs[:, used] - centre) / scale[used]
     product = z.T @ (targets - targets.mean(axis=0))
-    slopes[1:][used] = np.linalg.solve(z.T @ z + np.diag(ridge[used]), product) / unit[used, None]
+    slopes[1:][used] = np.linalg.solve(z.T @ z + np.diag(ridge[used]), product) / scale[used, None]
     slopes[0] = targets.mean(axis=0) - centre @ slopes[1:][used]
     return slopes
 
@@ -138,30 +138,30 @@ class Dynamics:
         missed: (n, ds + 1) targets of n samples less what all others predict of them.
     """
 
-    motion: Motion
-    predict: Callable[[FloatArray], FloatArray]
-    missed: FloatArray
+    delta_targets: DeltaStateTargets
+    regression: Callable[[FloatArray], FloatArray]
+    loo_residuals: FloatArray
 
     @cached_property
     def residuals(self) -> FloatArray:
         """Changes of state (n, ds) less what all other samples predict of them."""
-        return self.motion.changes(self.missed)
+        return self.delta_targets.changes(self.loo_residuals)
 
-    def predicted(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def predict(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Successors (m, ds) and shares of real ends (m, 1) of inputs (m, ds + da), on average."""
-        targets = self.motion.trend(inputs) + self.predict(inputs)
+        targets = self.delta_targets.linear_mean(inputs) + self.regression(inputs)
         states = inputs[:, : self.residuals.shape[1]]
-        return states + self.motion.changes(targets), np.clip(targets[:, -1:], 0.0, 1.0)
+        return states + self.delta_targets.changes(targets), np.clip(targets[:, -1:], 0.0, 1.0)
 
-    def drawn(
-        self, rows: IntArray, inputs: FloatArray, sides: FloatArray
+    def sample(
+        self, rows: IntArray, inputs: FloatArray, residual_signs: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """One successor (m, ds) each, with the noise of samples (m,); and shares of ends (m,).
 
         To which sides (m, 1), plus or minus one, is for the caller to draw.
         """
-        successors, ends = self.predicted(inputs)
-        return successors + sides * self.residuals[rows], ends[:, 0]
+        successors, ends = self.predict(inputs)
+        return successors + residual_signs * self.residuals[rows], ends[:, 0]
 
     def expected_features(
         self, basis: Basis, start: FloatArray, rows: IntArray, inputs: FloatArray
@@ -177,7 +177,7 @@ class Dynamics:
         expected = np.empty((len(rows), len(start)))
         for first in range(0, len(rows), ROWS):
             block = slice(first, first + ROWS)
-            successors, ends = self.predicted(inputs[block])
+            successors, ends = self.predict(inputs[block])
             residuals = self.residuals[rows[block]]
             spread = 0.5 * basis.features(successors + residuals)
             spread += 0.5 * basis.features(successors - residuals)
@@ -185,7 +185,7 @@ class Dynamics:
         return expected
 
 
-def observed_expectation(
+def expected_features_of_samples(
     data: Transitions,
     basis: Basis,
     own: FloatArray,
@@ -206,11 +206,11 @@ def observed_expectation(
         task: which coordinates are angles.
     """
     terminated = data.terminated[:, None].astype(np.float64)
-    ends = np.clip(terminated - dynamics.missed[:, -1:], 0.0, 1.0)
-    predicted = data.states + state_changes(data, task) - dynamics.residuals
-    spread = 0.5 * (observed + basis.features(predicted - dynamics.residuals))
+    ends = np.clip(terminated - dynamics.loo_residuals[:, -1:], 0.0, 1.0)
+    predict = data.states + state_changes(data, task) - dynamics.residuals
+    spread = 0.5 * (observed + basis.features(predict - dynamics.residuals))
     after = after_ends(observed, terminated, start)
-    foreseen = after_ends(basis.features(predicted), ends, start)
+    foreseen = after_ends(basis.features(predict), ends, start)
     return after_ends(spread, ends, start), LeaveOneOut(after - own, after - foreseen)
 
 
@@ -225,8 +225,8 @@ def fit_dynamics(
 
     Arguments are those of `kreps.algorithms.transition_model.fit_regression`, but for the targets.
     """
-    motion = Motion.of(data, task)
-    targets = motion.targets(data, task)
+    delta_targets = DeltaStateTargets.of(data, task)
+    targets = delta_targets.targets(data, task)
     model, x = fit_regression(data, targets, state_kernel, task, start, rng)
-    missed = model.leave_one_out(targets).errors
-    return Dynamics(motion, model.predictor(targets), missed), x, model.factor.jitter
+    loo_residuals = model.leave_one_out(targets).errors
+    return Dynamics(delta_targets, model.predictor(targets), loo_residuals), x, model.factor.jitter

@@ -1,9 +1,8 @@
-"""Roll-outs of a policy in the transition model: states that no real one has been in yet.
+"""The learnt dynamics as an environment: rollouts of policies in the model.
 
-The weights of the first step say where the new policy will be, but only among the states that old
-policies were in.  On its own way, and just beside it, nothing would say what to do.  The dynamics
-know where it leads, so a third step imagines actions there.  And what its policy earns can be
-foretold before it acts: see `kreps.algorithms.judgement`.
+The weights of the first step only weigh states that old policies visited.  Model rollouts reach the
+states that the new policy visits, and they predict its return before it acts (see
+`kreps.algorithms.acceptance`).
 """
 
 from __future__ import annotations
@@ -20,55 +19,53 @@ from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
 from kreps.kernels.gram import PANEL
 from kreps.kernels.kernel import Kernel
-from kreps.models.dynamics import TREND_SAMPLES, Dynamics
+from kreps.models.dynamics import SAMPLES_PER_COEFFICIENT, Dynamics
 from kreps.policies.base import StochasticPolicy
 
-AVERAGED = 2.0
-"""Steps that a policy is followed for, in mean lengths of a roll-out: one in seven has not been
-restarted by then."""
+EVALUATION_LENGTHS = 2.0
+"""Steps over which a policy is evaluated, in mean lengths of a rollout: by then a share of
+exp(-2) of the rollouts would not have been restarted."""
 
 
-def can_be_simulated(data: Transitions, task: TaskSpec) -> bool:
-    """Whether states that the dynamics predict are states.
+def supports_model_rollouts(data: Transitions, task: TaskSpec) -> bool:
+    """Whether predictions of the dynamics can be fed back into them.
 
-    Those of images are none: errors of single pixels add up to what no rod or arm looks like.  And
-    with fewer samples than a trend needs, what is predicted of many coordinates is no better.
+    Not in images, where errors of single pixels add up to what no image of the task looks like; nor
+    with fewer samples than the linear mean of the dynamics needs.
     """
-    coordinates = 1 + task.observation_size + task.action_size
-    return task.image_shape is None and len(data) >= TREND_SAMPLES * coordinates
+    coefficients = 1 + task.observation_size + task.action_size
+    return task.image_shape is None and len(data) >= SAMPLES_PER_COEFFICIENT * coefficients
 
 
 @dataclass(frozen=True)
-class Followed:
-    """Simulated roll-outs of one policy.
+class ModelRollouts:
+    """Rollouts of one policy in the model.
 
     Attributes:
         rewards: (steps, count) expected, standardised.
-        likeness: (steps, count) of each state to the nearest sample: the kernel's value, up to 1.
-        ended: (steps, count) whether the task really ended, and the next state is a start.
+        similarity: (steps, count) of each state to its nearest sample: the kernel's value, up to 1.
+        terminated: (steps, count) whether the episode ended, so that the next state is a start.
     """
 
     rewards: FloatArray
-    likeness: FloatArray
-    ended: BoolArray
+    similarity: FloatArray
+    terminated: BoolArray
 
-    def feared_rewards(self, least: float, typical: float) -> FloatArray:
-        """Rewards (steps, count) if what is not known is the worst.
-
-        The less a state is like any sample, the nearer its reward is taken to be to the least one.
+    def pessimistic_rewards(self, smallest: float, typical: float) -> FloatArray:
+        """Rewards (steps, count), shrunk towards the smallest one where no sample is similar.
 
         Args:
-            least: of all rewards, standardised.
-            typical: likeness from which on a state is known.
+            smallest: of all observed rewards, standardised.
+            typical: similarity from which on a reward is used as predicted.
         """
-        known = np.minimum(self.likeness / typical, 1.0)
-        return least + known * (self.rewards - least)
+        known = np.minimum(self.similarity / typical, 1.0)
+        return smallest + known * (self.rewards - smallest)
 
 
 def average_reward(rewards: FloatArray, restart_probability: float) -> FloatArray:
     """Average reward per step (count,) of the restarting process, from each start.
 
-    A step counts by the chance that there has been no restart yet.
+    Step t counts by the probability ``(1 - p)^t`` that there has been no restart yet.
 
     Args:
         rewards: (steps, count) without restarts.
@@ -79,44 +76,66 @@ def average_reward(rewards: FloatArray, restart_probability: float) -> FloatArra
 
 
 @dataclass(frozen=True)
-class Chance:
-    """What is drawn for one step of m roll-outs, whatever the policy.
+class RolloutNoise:
+    """The random numbers of one step of m rollouts, common to all policies compared.
 
     Attributes:
-        noise: (m, da) standard normal, of the actions.
-        sides: (m, 1) one or minus one: to which side a residual is added.
-        ends: (m,) uniform; the task ends where its chance to is larger.
+        action_noise: (m, da) standard normal.
+        residual_signs: (m, 1) one or minus one: the sign with which a residual is added.
+        end_uniforms: (m,) in [0, 1); the episode ends where its probability to end is larger.
     """
 
-    noise: FloatArray
-    sides: FloatArray
-    ends: FloatArray
+    action_noise: FloatArray
+    residual_signs: FloatArray
+    end_uniforms: FloatArray
 
     @classmethod
-    def of(cls, count: int, action_size: int, rng: np.random.Generator) -> Chance:
-        noise = rng.standard_normal((count, action_size))
-        sides = np.where(rng.integers(2, size=(count, 1)) == 0, 1.0, -1.0)
-        return cls(noise, sides, rng.uniform(size=count))
+    def sample(cls, count: int, action_size: int, rng: np.random.Generator) -> RolloutNoise:
+        action_noise = rng.standard_normal((count, action_size))
+        residual_signs = np.where(rng.integers(2, size=(count, 1)) == 0, 1.0, -1.0)
+        return cls(action_noise, residual_signs, rng.uniform(size=count))
 
-    def repeated(self, times: int) -> Chance:
-        """The same for each of so many policies."""
-        noise, sides = (np.tile(each, (times, 1)) for each in (self.noise, self.sides))
-        return Chance(noise, sides, np.tile(self.ends, times))
+    def repeated(self, times: int) -> RolloutNoise:
+        """The same numbers for each of so many policies."""
+        return RolloutNoise(
+            np.tile(self.action_noise, (times, 1)),
+            np.tile(self.residual_signs, (times, 1)),
+            np.tile(self.end_uniforms, times),
+        )
 
 
 @dataclass(frozen=True)
-class Simulator:
-    """The restarting process, as learnt from n samples.
+class ModelStep:
+    """One step of m rollouts.
+
+    Attributes:
+        nearest: (m,) the sample nearest to each state.
+        similarity: (m,) to it.
+        inputs: (m, ds + da) states and scaled, applied actions.
+        successors: (m, ds) within the range of the data.
+        terminated: (m,) whether the episode ended.
+    """
+
+    nearest: IntArray
+    similarity: FloatArray
+    inputs: FloatArray
+    successors: FloatArray
+    terminated: BoolArray
+
+
+@dataclass(frozen=True)
+class ModelEnv:
+    """The restarting process as learnt from n samples.
 
     Attributes:
         dynamics: of the samples.
         data: the samples.
-        kernel: over states; it tells which sample a state is nearest to.
+        kernel: over states, for the nearest sample of a state.
         task: limits and scale of the actions, and which coordinates are angles.
         restart_probability: p.
-        exploring_starts: share of the roll-outs that begin in any sampled state, the others in
+        exploring_starts: share of the rollouts that begin in any sampled state, the others in
             start states.
-        longest: steps that a roll-out has at most.
+        max_steps: largest number of steps of a rollout.
     """
 
     dynamics: Dynamics
@@ -125,99 +144,92 @@ class Simulator:
     task: TaskSpec
     restart_probability: float
     exploring_starts: float
-    longest: int
+    max_steps: int
 
-    def rollouts(
+    def visited_states(
         self, policy: StochasticPolicy, count: int, rng: np.random.Generator
     ) -> tuple[FloatArray, IntArray]:
-        """States (m, ds) that a policy is led to, and the sample (m,) that each is nearest to.
+        """States (m, ds) visited in rollouts of a policy, and the sample (m,) nearest to each.
 
         Args:
-            policy: to be followed, with its noise.
-            count: m, unless roll-outs come to a real end.
-            rng: of lengths, starts, noise and ends.
+            policy: with its exploration noise.
+            count: m, unless episodes end earlier.
+            rng: of lengths, starts and noise.
         """
-        left = np.minimum(rng.geometric(self.restart_probability, size=count), self.longest)
+        left = np.minimum(rng.geometric(self.restart_probability, size=count), self.max_steps)
         left = left[: 1 + np.searchsorted(np.cumsum(left), count)]
         left[-1] -= left.sum() - count
         visited, nearest = [], []
         states = self._starts(len(left), rng)
         while len(states):
-            chance = Chance.of(len(states), self.task.action_size, rng)
-            rows, _, _, successors, ended = self._step(policy.act, states, chance)
+            noise = RolloutNoise.sample(len(states), self.task.action_size, rng)
+            step = self._step(policy.act, states, noise)
             visited.append(states)
-            nearest.append(rows)
-            left = np.where(ended, 0, left - 1)
-            states, left = successors[left > 0], left[left > 0]
+            nearest.append(step.nearest)
+            left = np.where(step.terminated, 0, left - 1)
+            states, left = step.successors[left > 0], left[left > 0]
         return np.concatenate(visited), np.concatenate(nearest)
 
-    def follow(
+    def evaluate(
         self,
         policies: Sequence[StochasticPolicy],
         reward: Callable[[FloatArray], FloatArray],
         count: int,
         rng: np.random.Generator,
-    ) -> list[Followed]:
-        """Each policy from so many starts, without random restarts.
-
-        They are followed side by side, and meet the same chance: starts, noise and ends.
+    ) -> list[ModelRollouts]:
+        """Rollouts of each policy, without random restarts, with common random numbers.
 
         Args:
-            policies: to be followed, each with its noise.
-            reward: of states and scaled, applied actions (m, ds + da).
-            count: of the starts.
-            rng: of the chance.
+            policies: with their exploration noise.
+            reward: expected reward (m,) of states and scaled, applied actions (m, ds + da).
+            count: rollouts per policy.
+            rng: of starts and noise.
         """
         many = len(policies)
-        steps = min(ceil(AVERAGED / self.restart_probability), self.longest)
+        steps = min(ceil(EVALUATION_LENGTHS / self.restart_probability), self.max_steps)
 
         def act(states: FloatArray, noise: FloatArray) -> FloatArray:
             parts = zip(policies, np.split(states, many), np.split(noise, many), strict=True)
             return np.concatenate([policy.act(*part) for policy, *part in parts])
 
-        asked, likeness, ends = [], [], []
+        inputs, similarity, terminated = [], [], []
         states = np.tile(self._starts(count, rng), (many, 1))
         for _ in range(steps):
-            chance = Chance.of(count, self.task.action_size, rng).repeated(many)
-            _, alike, inputs, successors, ended = self._step(act, states, chance)
-            asked.append(inputs)
-            likeness.append(alike)
-            ends.append(ended)
-            if ended.any():
-                anew = np.tile(self._starts(count, rng), (many, 1))
-                successors = np.where(ended[:, None], anew, successors)
-            states = successors
-        rewards = reward(np.concatenate(asked))
+            noise = RolloutNoise.sample(count, self.task.action_size, rng).repeated(many)
+            step = self._step(act, states, noise)
+            inputs.append(step.inputs)
+            similarity.append(step.similarity)
+            terminated.append(step.terminated)
+            states = step.successors
+            if step.terminated.any():
+                starts = np.tile(self._starts(count, rng), (many, 1))
+                states = np.where(step.terminated[:, None], starts, states)
+        rewards = reward(np.concatenate(inputs))
         each = (
             np.split(np.reshape(values, (steps, many * count)), many, axis=1)
-            for values in (rewards, likeness, ends)
+            for values in (rewards, similarity, terminated)
         )
-        return [Followed(*parts) for parts in zip(*each, strict=True)]
+        return [ModelRollouts(*parts) for parts in zip(*each, strict=True)]
 
     def _step(
         self,
         act: Callable[[FloatArray, FloatArray], FloatArray],
         states: FloatArray,
-        chance: Chance,
-    ) -> tuple[IntArray, FloatArray, FloatArray, FloatArray, BoolArray]:
-        """One step from states (m, ds), real ends and random restarts left to the caller.
-
-        The nearest samples (m,) and their likeness (m,), the states and applied actions
-        (m, ds + da), successors (m, ds) within the range of the data, and whether the task ended
-        (m,).
-        """
-        rows, likeness = self.nearest(states)
-        actions = self.task.scaled(self.task.clip(act(states, chance.noise)))
+        noise: RolloutNoise,
+    ) -> ModelStep:
+        """One step from states (m, ds); starts after ends and restarts are left to the caller."""
+        nearest, similarity = self.nearest(states)
+        actions = self.task.scaled(self.task.clip(act(states, noise.action_noise)))
         inputs = np.concatenate([states, actions], axis=1)
-        successors, ends = self.dynamics.drawn(rows, inputs, chance.sides)
-        ended = chance.ends < ends
-        return rows, likeness, inputs, np.clip(successors, *self._range), ended
+        successors, ends = self.dynamics.sample(nearest, inputs, noise.residual_signs)
+        successors = np.clip(successors, *self._range)
+        return ModelStep(nearest, similarity, inputs, successors, noise.end_uniforms < ends)
 
     @cached_property
     def _samples(self) -> tuple[FloatArray, FloatArray]:
-        """Mean (e,) of the samples' coordinates, and what `nearest` multiplies by (e + 1, n).
+        """Mean (e,) of the samples' embedded coordinates, and the factor (e + 1, n) of `nearest`.
 
-        These are their distances from it, and minus half their squares.
+        The factor's columns are the centred coordinates and minus half their squared norm.
         """
         coordinates = self.kernel.embed(self.data.states)
         mean = coordinates.mean(axis=0)
@@ -233,11 +245,11 @@ class Simulator:
         mean, samples = self._samples
         embedded = self.kernel.embed(states) - mean
         extended = np.concatenate([embedded, np.ones((len(embedded), 1))], axis=1)
-        tall = max(1, PANEL // samples.shape[1])  # few enough that the products stay in the cache
+        height = max(1, PANEL // samples.shape[1])  # few enough that products stay in the cache
         rows = np.concatenate(
             [
-                np.argmax(extended[i : i + tall] @ samples, axis=1)
-                for i in range(0, max(1, len(extended)), tall)
+                np.argmax(extended[i : i + height] @ samples, axis=1)
+                for i in range(0, max(1, len(extended)), height)
             ]
         )
         apart = embedded - samples[:-1, rows].T
@@ -252,9 +264,9 @@ class Simulator:
 
     @cached_property
     def _range(self) -> tuple[FloatArray, FloatArray]:
-        """Least and largest state (ds,) seen: beyond them nothing is known that could stop one.
+        """Smallest and largest state (ds,) observed, to which predictions are clipped.
 
-        Angles have no limits.
+        Angles are not clipped.
         """
         low, high = self.data.points.min(axis=0), self.data.points.max(axis=0)
         angles = list(self.task.periodic)

@@ -1,13 +1,12 @@
-"""What is not known is thought to be good: the optimism of R-max (Brafman and Tennenholtz 2002).
+"""An exploration bonus for states that are unlike any sample, as in R-max.
 
-A policy that holds the best state it has seen makes no other data, and what it has never seen is
-not imagined either: a local optimum is for ever.  So in the model whoever comes to what no sample
-is like earns a good reward there, step after step, until the restart; which is worth a detour as no
-reward of one step would be.  V need not know of it: to the update it is an action that earns all of
-that at once, and is followed by the restart.
+A policy that holds the best state it has seen collects no other data, so a local optimum would be
+kept for ever.  In R-max (Brafman and Tennenholtz 2002) an unexplored region is an absorbing state
+that pays an optimistic reward until the restart.  Its total value is added to the reward of the
+action that leads there.
 
-What is like the samples is told by the samples: nearly all of them have one of another roll-out
-within a certain distance, and what is farther off is unknown, the farther the more.
+A state counts as explored if it is within the novelty radius of a sample: nearly all samples have a
+sample of another rollout within that radius.
 """
 
 from __future__ import annotations
@@ -17,115 +16,119 @@ from dataclasses import dataclass
 import numpy as np
 
 from kreps.kernels.arrays import FloatArray
-from kreps.models.model_env import Followed, Simulator
-from kreps.settings import Settings
+from kreps.models.model_env import ModelEnv, ModelRollouts
 
-KEPT = 0.35
-"""What is left of the optimism after each update: later, what is not known was passed by."""
+DECAY = 0.35
+"""Factor of the bonus after each update: regions that stay unexplored were passed by."""
 
-LEAST = 0.005
-"""Less optimism is none."""
+MIN_STRENGTH = 0.005
+"""A smaller bonus is left out."""
 
-HIGHEST = 2.0
-"""Deviations of the reward above its mean that are hoped for at most: where the best reward is a
-seldom goal, not all that is unknown is another one."""
+MAX_REWARD_SD = 2.0
+"""Largest optimistic reward, in standard deviations above the mean reward: where the best reward is
+a goal that is seldom reached, an unexplored region need not hold another one."""
 
-KNOWN = 0.9
-"""Share of the samples that are known from other roll-outs."""
+KNOWN_QUANTILE = 0.9
+"""Share of the samples that lie within the novelty radius of a sample of another rollout."""
 
-ROUNDING = 1e-12
-"""Least distance that is known: states that are equal but for rounding are."""
+MIN_RADIUS = 1e-12
+"""Smallest novelty radius: states that are equal up to rounding are explored."""
 
-AT_ONCE = 3_000
-"""Samples that all are compared with at once, so that memory grows like their number."""
+BLOCK = 3_000
+"""Samples compared with all others at once, which bounds the memory."""
 
 _TINY = float(np.finfo(np.float64).tiny)
 
 
 @dataclass(frozen=True)
-class Optimism:
-    """What is hoped for where nothing is known.
+class NoveltyBonus:
+    """The exploration bonus of one update.
 
     Attributes:
-        hoped: reward per step that is earned there until a restart, standardised.
-        gain: reward per step that the samples earn as they are weighed, standardised.
-        edge: half the squared distance, in lengthscales, up to which a state is known.
+        optimistic_reward: per step in an unexplored region, until the restart, standardised.
+        average_reward: per step, of the samples with the weights of the update, standardised.
+        known_radius: half the squared distance, in lengthscales, up to which a state is explored.
     """
 
-    hoped: float
-    gain: float
-    edge: float
+    optimistic_reward: float
+    average_reward: float
+    known_radius: float
 
-    def unknown(self, likeness: FloatArray) -> FloatArray:
-        """How far states are from being known, 0 to 1.
+    def novelty(self, similarity: FloatArray) -> FloatArray:
+        """Novelty of states, from 0 within the radius to 1 far away.
 
         Args:
-            likeness: of the states to the nearest sample, up to 1, of any shape, such as (m,).
+            similarity: of the states to their nearest sample, the kernel's value, of any shape.
         """
-        far = -np.log(np.maximum(likeness, _TINY))
-        return -np.expm1(-np.maximum(far - self.edge, 0.0) / self.edge)
+        distance = -np.log(np.maximum(similarity, _TINY))
+        return -np.expm1(-np.maximum(distance - self.known_radius, 0.0) / self.known_radius)
 
-    def surplus(self, restart_probability: float) -> float:
-        """What an action that leads there earns more than the samples on average, in all.
+    def exploration_bonus(self, restart_probability: float) -> float:
+        """Total value of reaching an unexplored region, relative to the average reward.
 
-        ``sum_k (1 - p)^k (hoped - gain)`` over the steps from the next one to the restart.
+        ``sum_k (1 - p)^k (optimistic_reward - average_reward)`` over the steps k >= 1 to the
+        restart.
         """
-        return (1.0 - restart_probability) / restart_probability * (self.hoped - self.gain)
+        steps = (1.0 - restart_probability) / restart_probability
+        return steps * (self.optimistic_reward - self.average_reward)
 
-    def hoped_rewards(self, followed: Followed) -> FloatArray:
-        """Rewards (steps, count) of roll-outs in the model if who finds the unknown stays there.
+    def optimistic_rewards(self, rollouts: ModelRollouts) -> FloatArray:
+        """Rewards (steps, count) of model rollouts if unexplored regions are absorbing.
 
-        As unknown is a matter of degree, so is staying; a real end is followed by a start.
+        Novelty is in [0, 1], and so is the share of a rollout that has been absorbed.  The end of
+        an episode is followed by a start state, where nothing is absorbed.
         """
-        known_yet = np.ones(followed.rewards.shape[1])
-        rewards = np.empty_like(followed.rewards)
-        for t, unknown in enumerate(self.unknown(followed.likeness)):
-            known_yet = known_yet * (1.0 - unknown)
-            rewards[t] = self.hoped + known_yet * (followed.rewards[t] - self.hoped)
-            known_yet[followed.ended[t]] = 1.0
+        explored = np.ones(rollouts.rewards.shape[1])
+        rewards = np.empty_like(rollouts.rewards)
+        for t, novelty in enumerate(self.novelty(rollouts.similarity)):
+            explored = explored * (1.0 - novelty)
+            optimistic = self.optimistic_reward
+            rewards[t] = optimistic + explored * (rollouts.rewards[t] - optimistic)
+            explored[rollouts.terminated[t]] = 1.0
         return rewards
 
 
-def optimism_of(
-    simulator: Simulator | None,
+def novelty_bonus(
+    model_env: ModelEnv | None,
     rewards: FloatArray,
     weights: FloatArray,
+    initial: float,
     updates: int,
-    settings: Settings,
-) -> Optimism | None:
-    """The optimism of one update; None where there is none.
+) -> NoveltyBonus | None:
+    """The exploration bonus of one update; None where there is none.
 
     Args:
-        simulator: of its samples; None if nothing can be simulated.
-        rewards: (n,) of its samples, standardised.
-        weights: (n,) of the first step.
-        updates: that were made before.
-        settings: ``optimism`` of the first update.
+        model_env: of the samples; None if the model cannot be rolled out.
+        rewards: (n,) of the samples, standardised.
+        weights: (n,) of the first step, which sum to one.
+        initial: bonus of the first update, as a share of the way from the average reward to the
+            best one.
+        updates: made before.
     """
-    strength = settings.optimism * KEPT**updates
-    if simulator is None or strength < LEAST:
+    strength = initial * DECAY**updates
+    if model_env is None or strength < MIN_STRENGTH:
         return None
-    edge = known_distance(simulator)
-    if edge is None:
+    radius = novelty_radius(model_env)
+    if radius is None:
         return None
-    gain = float(weights @ rewards)
-    best = min(float(rewards.max()), float(rewards.mean()) + HIGHEST * float(rewards.std()))
-    return Optimism(gain + strength * max(best - gain, 0.0), gain, edge)
+    average = float(weights @ rewards)
+    best = min(float(rewards.max()), float(rewards.mean()) + MAX_REWARD_SD * float(rewards.std()))
+    return NoveltyBonus(average + strength * max(best - average, 0.0), average, radius)
 
 
-def known_distance(simulator: Simulator) -> float | None:
-    """Half the squared distance, in lengthscales, that `KNOWN` of the samples have another within.
+def novelty_radius(model_env: ModelEnv) -> float | None:
+    """Half the squared distance, in lengthscales, within which most samples have another rollout's.
 
-    Those of its own roll-out do not count, as they are near in any case.  None if all samples are
-    of one roll-out.
+    Samples of the same rollout do not count, as they are near in any case.  None if all samples are
+    of one rollout.
     """
-    states, of = simulator.data.states, simulator.data.rollout
-    if of[0] == of[-1]:
+    states, rollout = model_env.data.states, model_env.data.rollout
+    if rollout[0] == rollout[-1]:
         return None
     nearest = []
-    for i in range(0, len(states), AT_ONCE):
-        likeness = simulator.kernel.gram(states[i : i + AT_ONCE], states)
-        likeness[of[i : i + AT_ONCE, None] == of] = 0.0
-        nearest.append(likeness.max(axis=1))
-    likeness_of_edge = np.quantile(np.concatenate(nearest), 1.0 - KNOWN)
-    return max(-float(np.log(max(likeness_of_edge, _TINY))), ROUNDING)
+    for i in range(0, len(states), BLOCK):
+        similarity = model_env.kernel.gram(states[i : i + BLOCK], states)
+        similarity[rollout[i : i + BLOCK, None] == rollout] = 0.0
+        nearest.append(similarity.max(axis=1))
+    at_radius = np.quantile(np.concatenate(nearest), 1.0 - KNOWN_QUANTILE)
+    return max(-float(np.log(max(at_radius, _TINY))), MIN_RADIUS)

@@ -11,16 +11,16 @@ from kreps.data.rollout import Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.hyperparameters import EmbeddingLoss, Prior, factor_distances, minimise
-from kreps.kernels.kernel import Kernel, SquaredExponential, cut_factors, median_lengthscales
+from kreps.kernels.kernel import Kernel, SquaredExponential, median_lengthscales, wrap_factors
 from kreps.kernels.regression import KernelEmbedding, PivotedEmbedding
-from kreps.kernels.sampling import evidence, telling_rows
-from kreps.settings import Settings
+from kreps.kernels.sampling import effective_target_count, pps_subsample
+from kreps.settings import RKHS, Grid
 
-CUT_LENGTHSCALE = np.pi
+WRAP_LENGTHSCALE = np.pi
 """Of the numbers of angles in V's kernel, rad: a turn apart, states are ``exp(-2)`` alike, so that
 V can jump there, and little is lost where it need not."""
 
-UNCUT_LENGTHSCALE = 1e6
+UNWRAPPED_LENGTHSCALE = 1e6
 """The same, rad, where angles count their turns: all of one turn are alike."""
 
 
@@ -30,27 +30,30 @@ def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) ->
     return Kernel(factors, median_lengthscales(factors, data.points, rng))
 
 
-def with_cuts(kernel: Kernel, data: Transitions, task: TaskSpec, settings: Settings) -> Kernel:
-    """The kernel over states of what may jump where the numbers of an angle begin anew.
+def with_wrap_discontinuity(
+    kernel: Kernel, data: Transitions, task: TaskSpec, value: RKHS | Grid
+) -> Kernel:
+    """The kernel over states of V and of the reward model, which may jump where an angle wraps.
 
-    A reward often comes from the number, as ``-theta^2`` does, and jumps from one end of a turn to
-    the other; so does V, which has it in it.  What moves does not, nor does a good action.
+    A reward is often a function of the angle's number, such as ``-theta^2``, and jumps from one end
+    of the turn to the other.  So does V.  Dynamics and good actions are periodic.
 
     Args:
         kernel: over states, at V's lengthscales.
-        data: tells where the cut is: within the gap that its angles leave of a turn.  An angle that
-            counts its turns has none.
+        data: its angles leave a gap of the turn, in whose middle the numbers wrap.  An angle that
+            counts its turns leaves none and gets no discontinuity.
         task: which coordinates are angles.
-        settings: ``angles``; nothing is changed where they are round.
+        value: ``angle_wrap``; without effect where that is continuous, and on a grid.
     """
-    if settings.angles == "round" or settings.features == "grid":
+    if isinstance(value, Grid) or value.angle_wrap == "continuous":
         return kernel
     angles = data.points[:, list(task.periodic)]
     low, high = angles.min(axis=0), angles.max(axis=0)
-    begins = 0.5 * (low + high) - np.pi
-    lengthscales = np.where(high - low <= 2.0 * np.pi, CUT_LENGTHSCALE, UNCUT_LENGTHSCALE)
-    cuts = cut_factors(task.periodic, begins)
-    return Kernel((*kernel.factors, *cuts), np.append(kernel.lengthscales, lengthscales))
+    wraps_at = 0.5 * (low + high) - np.pi
+    within_a_turn = high - low <= 2.0 * np.pi
+    lengthscales = np.where(within_a_turn, WRAP_LENGTHSCALE, UNWRAPPED_LENGTHSCALE)
+    factors = wrap_factors(task.periodic, wraps_at)
+    return Kernel((*kernel.factors, *factors), np.append(kernel.lengthscales, lengthscales))
 
 
 def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
@@ -65,20 +68,19 @@ def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
     return successors
 
 
-def restart_features(starts: FloatArray, states: FloatArray, settings: Settings) -> FloatArray:
-    """Mean features (r,) of the states that the process restarts in, as the update sees it.
+def restart_features(starts: FloatArray, states: FloatArray, exploring_starts: float) -> FloatArray:
+    """Mean features (r,) of the states that the process restarts in, as the update plans.
 
-    A restart with probability p is a discount 1 - p, and under a discount there is a policy that
-    is best from every state at once: other restarts leave it optimal.  But the dual hardly settles
-    V where its weights are not, and noise leads there; exploring starts spread the weights.
+    A restart with probability p acts as a discount 1 - p.  Under a discount one policy is optimal
+    from every state, so other restart states leave it optimal.  But the dual hardly determines V
+    where its weights vanish, and noise leads there; exploring starts spread the weights.
 
     Args:
         starts, states: (r,) means over the start states and over the sampled states (in low rank:
-            over those of the sample).
-        settings: ``exploring_starts``, the share of the latter.
+            over those in memory).
+        exploring_starts: share of the latter.
     """
-    share = settings.exploring_starts
-    return (1.0 - share) * starts + share * states
+    return (1.0 - exploring_starts) * starts + exploring_starts * states
 
 
 def feature_differences(
@@ -127,16 +129,16 @@ def embedding_hyperparameters(
     )
     factors = (*state_kernel.factors, *action_factors)
     squares = np.sum((targets - targets.mean(axis=0)) ** 2, axis=1)
-    sample, weights = telling_rows(squares, rng)
-    of_actions = median_lengthscales(action_factors, inputs, rng)
-    typical = np.log(np.append(state_kernel.lengthscales, of_actions))
+    sample, weights = pps_subsample(squares, rng)
+    for_actions = median_lengthscales(action_factors, inputs, rng)
+    typical = np.log(np.append(state_kernel.lengthscales, for_actions))
     prior = Prior(
         centre=np.append(typical, np.log(1e-3)),
         spread=np.append(np.ones(len(factors)), 3.0),
         low=np.append(typical - 3.0, np.log(1e-6)),
         high=np.append(typical + 3.0, 0.0),
         # the loss is twice minus the log density of one Gaussian error whose variance is fitted
-        strength=2.0 / evidence(squares[sample], weights),
+        strength=2.0 / effective_target_count(squares[sample], weights),
     )
     loss = EmbeddingLoss(
         factor_distances(factors, inputs[sample]), targets[sample], weights / weights.mean()

@@ -1,15 +1,4 @@
-"""A second bounded step on actions drawn anew, with the transition model saying what they lead to.
-
-The weights of Eq. 1 can only choose among the actions that happened to be taken, one in each state.
-A transition model predicts for *any* action, so more can be asked of the same roll-outs: in the
-states as the first step reweighted them actions are drawn from its policy, and the same convex
-problem is solved once more for them.  The KL bound then holds from what they were drawn from, so
-that old roll-outs no longer tie the new policy to the old ones that made them.  And the policy so
-found is led by the model to states that no sample is in: there the same is done once again.
-
-What is compared in the model can be wide, and what is done in the world narrow: actions are drawn
-with more than the policy's deviation, and the one fitted to them acts with as much less of its own.
-"""
+"""What the learnt model predicts of any action: expected features, rewards and novelty."""
 
 from __future__ import annotations
 
@@ -18,53 +7,57 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray, IntArray
-from kreps.models.model_env import Simulator
-from kreps.models.novelty import Optimism
+from kreps.models.model_env import ModelEnv
+from kreps.models.novelty import NoveltyBonus
 
 
 @dataclass(frozen=True)
-class Outlook:
-    """What a model says of any action in the states of n samples.
+class WorldModel:
+    """The learnt model of n samples.
 
     Attributes:
-        states: (n, ds).
+        task: limits and scale of the actions.
+        states: (n, ds) sampled states.
         features: (n, r) of V there.
-        features_at: (m, r) of V at any states (m, ds).
+        phi: features (m, r) of V at any states (m, ds).
         restart: (r,) mean features of the states that the process restarts in.
         rewards: (n,) observed, standardised.
-        expect: expected features (m, r) of the successor, of the samples (m,) that states are of
-            or, if simulated, nearest to, and of states and scaled, applied actions (m, ds + da).
-        reward: what reward (m, 1) is to be expected of such states and actions, from its mean.
-        simulator: tells where a policy leads; None if the model does not.
-        optimism: about what no sample is like; None if there is none.
+        expected_features: ``E[phi(s')]`` (m, r) of sample numbers (m,), whose states the actions
+            are taken in or nearest to, and of states and scaled, applied actions (m, ds + da).
+        reward_model: expected reward (m, 1), less the mean, of such states and actions.
+        model_env: rolls policies out in the model; None if the model cannot.
+        bonus: exploration bonus; None if there is none.
     """
 
+    task: TaskSpec
     states: FloatArray
     features: FloatArray
-    features_at: Callable[[FloatArray], FloatArray]
+    phi: Callable[[FloatArray], FloatArray]
     restart: FloatArray
     rewards: FloatArray
-    expect: Callable[[IntArray, FloatArray], FloatArray]
-    reward: Callable[[FloatArray], FloatArray]
-    simulator: Simulator | None
-    optimism: Optimism | None
+    expected_features: Callable[[IntArray, FloatArray], FloatArray]
+    reward_model: Callable[[FloatArray], FloatArray]
+    model_env: ModelEnv | None
+    bonus: NoveltyBonus | None
 
-    def rewards_of(self, inputs: FloatArray) -> FloatArray:
+    def expected_rewards(self, inputs: FloatArray) -> FloatArray:
         """Expected rewards (m,), standardised, of states and scaled, applied actions (m, ds + da).
 
-        A regression may overshoot what was ever observed, and would be believed.
+        They are clipped to the range of the observed rewards, beyond which a regression may
+        overshoot.
         """
-        said = self.rewards.mean() + self.reward(inputs)[:, 0]
-        return np.clip(said, self.rewards.min(), self.rewards.max())
+        predicted = self.rewards.mean() + self.reward_model(inputs)[:, 0]
+        return np.clip(predicted, self.rewards.min(), self.rewards.max())
 
-    def unknown_of(self, inputs: FloatArray) -> FloatArray:
-        """How far actions lead to the unknown, 0 to 1: (m,), of inputs likewise.
+    def novelty(self, inputs: FloatArray) -> FloatArray:
+        """Novelty (m,), in [0, 1], of the successors of states and actions (m, ds + da).
 
-        What follows a real end is known: a start state.
+        A start state, which follows the end of an episode, has none.
         """
-        if self.simulator is None or self.optimism is None:
+        if self.model_env is None or self.bonus is None:
             return np.zeros(len(inputs))
-        successors, ends = self.simulator.dynamics.predicted(inputs)
-        _, likeness = self.simulator.nearest(successors)
-        return (1.0 - ends[:, 0]) * self.optimism.unknown(likeness)
+        successors, ends = self.model_env.dynamics.predict(inputs)
+        _, similarity = self.model_env.nearest(successors)
+        return (1.0 - ends[:, 0]) * self.bonus.novelty(similarity)

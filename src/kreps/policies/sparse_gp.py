@@ -93,7 +93,7 @@ class SparseGP:
             noise,
         )
 
-    def narrowed(self, times: float) -> SparseGP:
+    def deflated(self, times: float) -> SparseGP:
         """With a deviation so many times smaller, of process and noise alike: the mean stays."""
         return replace(
             self,

@@ -1,0 +1,196 @@
+"""What the policy is fitted to, and its hyper-parameters (Sec. 2, generalising the weights)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import inf
+
+import numpy as np
+
+from kreps.algorithms.dual import effective_sample_size
+from kreps.algorithms.generated import GeneratedSamples
+from kreps.data.rollout import Transitions
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.hyperparameters import PolicyLoss, Prior, factor_distances, minimise
+from kreps.kernels.kernel import Kernel
+from kreps.kernels.sampling import uniform_subsample
+from kreps.policies.base import LearntPolicy
+
+MIN_RELATIVE_WEIGHT = 0.05
+"""Samples with ``n p_i`` below this do not enter the policy: their effect on it is negligible."""
+
+MIN_ACTION_VARIANCE = 1e-4
+"""Smallest variance of the weighted actions within a state, in units of the action scale squared:
+exploration noise never vanishes altogether."""
+
+
+@dataclass(frozen=True)
+class PolicyTargets:
+    """The weighted samples that the policy is fitted to.
+
+    Attributes:
+        states: (m, ds).
+        targets: (m, da) commanded actions around their centre, in units of the action scale.
+        weights: (m,) ``p_i / sum p^2``: over all samples they sum to the effective sample size.
+        total_weight: sum of the weights of all samples, also of those left out by
+            `top_by_weight` or subsampling.
+        target_variance: (m,) variance of the actions that each target is the mean of, summed over
+            action coordinates; zero where it is one action.
+        action_variance: mean variance of an action coordinate within a state; infinite where there
+            is one action per state.
+    """
+
+    states: FloatArray
+    targets: FloatArray
+    weights: FloatArray
+    total_weight: float
+    target_variance: FloatArray
+    action_variance: float = inf
+
+    @classmethod
+    def from_samples(cls, data: Transitions, p: FloatArray, task: TaskSpec) -> PolicyTargets:
+        """The sampled actions of transitions (n) with weights p (n,), which sum to one."""
+        kept = len(p) * p >= MIN_RELATIVE_WEIGHT
+        targets = task.scaled(data.actions[kept])
+        weights = p[kept] * effective_sample_size(p)
+        total = float(weights.sum())
+        return cls(data.states[kept], targets, weights, total, np.zeros(len(weights)))
+
+    @classmethod
+    def from_generated(
+        cls, samples: GeneratedSamples, p: FloatArray, task: TaskSpec
+    ) -> PolicyTargets:
+        """One target per state: the weighted mean of the actions that were generated there.
+
+        The Gaussian process then has as many support points as there are states, and a mean of
+        several actions has their summed weight.
+
+        Args:
+            samples: m generated actions.
+            p: (m,) their weights, which sum to one.
+            task: centre and scale of the actions.
+        """
+        kept = len(p) * p >= MIN_RELATIVE_WEIGHT
+        each = p[kept] * effective_sample_size(p)
+        actions = task.scaled(samples.actions[kept])
+        rows, group = np.unique(samples.state_of[kept], return_inverse=True)
+        weights = np.zeros(len(rows))
+        targets = np.zeros((len(rows), task.action_size))
+        target_variance = np.zeros(len(rows))
+        np.add.at(weights, group, each)
+        np.add.at(targets, group, (each / weights[group])[:, None] * actions)
+        squares = np.sum((actions - targets[group]) ** 2, axis=1)
+        share = each / weights[group]
+        np.add.at(target_variance, group, share * squares)
+        # Bessel's correction for weighted means of few actions
+        freedom = float(weights.sum() - each @ share) * task.action_size
+        summed = float(weights @ target_variance)
+        variance = summed / freedom if freedom > 1e-9 * weights.sum() else inf
+        total = float(weights.sum())
+        return cls(samples.states[rows], targets, weights, total, target_variance, variance)
+
+    def concat(self, earlier: PolicyTargets) -> PolicyTargets:
+        """These and those of an earlier step."""
+        sums = np.array([self.weights.sum(), earlier.weights.sum()])
+        return PolicyTargets(
+            np.concatenate([self.states, earlier.states]),
+            np.concatenate([self.targets, earlier.targets]),
+            np.concatenate([self.weights, earlier.weights]),
+            self.total_weight + earlier.total_weight,
+            np.concatenate([self.target_variance, earlier.target_variance]),
+            float(sums @ [self.action_variance, earlier.action_variance] / sums.sum()),
+        )
+
+    def top_by_weight(self, count: int) -> PolicyTargets:
+        """The ``count`` heaviest of them, in their order."""
+        if len(self.weights) <= count:
+            return self
+        kept = np.sort(np.argsort(-self.weights, kind="stable")[:count])
+        return replace(
+            self,
+            states=self.states[kept],
+            targets=self.targets[kept],
+            weights=self.weights[kept],
+            target_variance=self.target_variance[kept],
+        )
+
+
+@dataclass(frozen=True)
+class PolicyFit:
+    """A fitted policy.
+
+    Attributes:
+        policy: it.
+        x: (g + 2,) the log hyper-parameters of its fit (`policy_hyperparameters`).
+        support: number of its support points.
+        noise: variance with which it explores, in units of the action scale squared.
+    """
+
+    policy: LearntPolicy
+    x: FloatArray
+    support: int
+    noise: float
+
+
+def policy_hyperparameters(
+    samples: PolicyTargets,
+    state_kernel: Kernel,
+    policy_fit: str,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+) -> FloatArray:
+    """Log lengthscales (g,), log sf2 and log l of the policy, by weighted leave-one-out density.
+
+    Args:
+        samples: those that the policy is fitted to, or some of them.
+        state_kernel: its factors are those of the policy's kernel, with other lengthscales.
+        policy_fit: ``"map"``, with priors around median distances; or ``"bounded"``, within hard
+            ranges.
+        start: log hyper-parameters (g + 2,) to start the fit from; None for the prior's centre.
+        rng: chooses the samples of the fit.
+    """
+    median = np.log(state_kernel.lengthscales)
+    g = len(median)
+    share = samples.weights / samples.weights.sum()
+    centred = samples.targets - share @ samples.targets
+    variance = float(np.mean(share @ centred**2))
+    variance += float(share @ samples.target_variance) / centred.shape[1]
+    log_variance = np.log(max(variance, 1e-4))
+    centre = np.concatenate([median - 0.5, [log_variance - 0.3, log_variance - 1.0]])
+    if policy_fit == "map":
+        prior = Prior(
+            centre=centre,
+            spread=np.concatenate([np.full(g, 0.7), [1.0, 1.0]]),
+            low=np.concatenate([median - 4.0, np.log([1e-4, 1e-4])]),
+            high=np.concatenate([median + 3.0, np.log([1e2, 1e2])]),
+            strength=1.0 / samples.total_weight,
+        )
+    else:
+        prior = Prior(
+            centre=centre,
+            spread=np.ones(g + 2),
+            low=np.concatenate([median + np.log(0.3), np.log([0.01, 1e-4])]),
+            high=np.concatenate([median, np.log([3.0, 4.0])]),
+            strength=0.0,
+        )
+    rows = uniform_subsample(len(share), rng)
+    loss = PolicyLoss(
+        factor_distances(state_kernel.factors, samples.states[rows]),
+        samples.targets[rows],
+        samples.weights[rows],
+        samples.target_variance[rows],
+    )
+    return minimise(loss, prior, centre if start is None else start)
+
+
+def exploration_noise(samples: PolicyTargets, fitted: float) -> tuple[FloatArray, float]:
+    """Weights (m,) and noise l of the policy, from the fitted noise.
+
+    The fitted noise also contains the residuals of the mean, which are large where the targets
+    jump.  The policy explores with at most the variance of the weighted actions within a state.
+    Weights are divided by the same factor as the noise, so that ``l / w_i``, and with it the mean,
+    stays as fitted.
+    """
+    noise = min(fitted, max(samples.action_variance, MIN_ACTION_VARIANCE))
+    return samples.weights * (noise / fitted), noise
