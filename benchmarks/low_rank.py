@@ -27,7 +27,6 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import kreps
-from kreps.app.plots import BLUE, GREY, ORANGE, STYLE
 from kreps.data.dataset import CHUNK
 from kreps.data.task import TaskSpec
 from kreps.experiments.runner import commit
@@ -36,6 +35,7 @@ from kreps.kernels.basis import FourierBasis, RKHSBasis
 from kreps.kernels.kernel import Kernel, factors_of
 from kreps.kernels.threads import blas_threads
 from kreps.learning.collect import simulate
+from kreps.plotting import BLUE, GREY, ORANGE, STYLE
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 from kreps.policies.exploration import BangBang
 from kreps.policies.sparse_gp import PolicySums, SparseGP

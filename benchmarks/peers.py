@@ -56,7 +56,6 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from kreps.app.run_folder import versions
 from kreps.data.task import TaskSpec
 from kreps.envs import RandomRestart
 from kreps.experiments.executors import executor
@@ -68,6 +67,7 @@ from kreps.learning.environment import Environment, task_of
 from kreps.learning.evaluate import EPISODES, STEPS, evaluate
 from kreps.learning.storage import write_atomically
 from kreps.seeding import Purpose, integer_seed
+from kreps.versions import versions
 
 RESTART = 0.02
 MARKS = (3000, 5000, 8000)

@@ -23,10 +23,10 @@ import numpy as np
 from peers import MARKS, TASKS, Stopwatch, Trial, add_tasks, model_of, positive, seeds_of, write
 
 import kreps
-from kreps.app.run_folder import versions
 from kreps.experiments.runner import commit
 from kreps.experiments.tables import markdown
 from kreps.kernels.threads import blas_threads
+from kreps.versions import versions
 
 LEARNERS = ("kreps", "sac")
 

@@ -32,8 +32,6 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import kreps
-from kreps.app.plots import COLOURS, GREY, STYLE, save
-from kreps.app.run_folder import versions
 from kreps.experiments.runner import commit
 from kreps.experiments.tables import markdown
 from kreps.kernels.arrays import FloatArray
@@ -41,7 +39,9 @@ from kreps.kernels.threads import blas_threads
 from kreps.learning.environment import task_of
 from kreps.learning.evaluate import evaluate, stochastic_and_greedy
 from kreps.learning.policy import mean_difference
+from kreps.plotting import COLOURS, GREY, STYLE, save
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
+from kreps.versions import versions
 
 SUPPORT = 1500
 CENTRES = (10, 20, 30, 50, 100, 200)

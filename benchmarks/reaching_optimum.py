@@ -21,11 +21,11 @@ import numpy as np
 from scipy.optimize import minimize
 
 from kreps import KREPS
-from kreps.app.run_folder import versions
 from kreps.envs.reaching import MAX_TORQUE, ReachingBatch
 from kreps.experiments.runner import commit
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.evaluate import Greedy, evaluation_rollouts
+from kreps.versions import versions
 
 RESTART = 0.02
 HORIZON = 400  # periods of the value that is reported, of which 3e-4 of the weight is missing

@@ -14,9 +14,9 @@ from measuring import Measured
 from peak import Peak
 from threadpoolctl import threadpool_info
 
-from kreps.app.run_folder import versions
 from kreps.experiments.runner import commit
 from kreps.experiments.tables import markdown
+from kreps.versions import versions
 
 HEADINGS = ("work", "size", "CPU s", "MB", "number", "of what", "asked for", "met")
 

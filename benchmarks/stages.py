@@ -15,7 +15,7 @@ from pathlib import Path
 from matplotlib import colormaps, rc_context
 from matplotlib.figure import Figure
 
-from kreps.app.plots import GREY, STYLE
+from kreps.plotting import GREY, STYLE
 
 Stages = dict[str, float]
 

@@ -19,12 +19,12 @@ import numpy as np
 from scipy import sparse
 
 import kreps
-from kreps.app.run_folder import versions
 from kreps.envs import swing_up
 from kreps.experiments.runner import commit
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.environment import task_of
 from kreps.learning.evaluate import evaluate
+from kreps.versions import versions
 
 RESTART = 0.02
 MAX_VELOCITY = 25.0  # rad/s; beyond it the grid's edge stands for all

@@ -35,7 +35,6 @@ from kreps.algorithms.dual import (
 )
 from kreps.algorithms.newton import solve_dual
 from kreps.algorithms.state import LearnerState
-from kreps.app.plots import BLUE, GREY, ORANGE, STYLE
 from kreps.data.rollout import Rollout
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
@@ -44,6 +43,7 @@ from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import KernelExpansion, RKHSBasis
 from kreps.kernels.regression import KernelEmbedding
 from kreps.models.transition import feature_differences, state_kernel, successor_features
+from kreps.plotting import BLUE, GREY, ORANGE, STYLE
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 from kreps.policies.exploration import Gaussian

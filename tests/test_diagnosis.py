@@ -17,9 +17,9 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from kreps import plotting
 from kreps.algorithms.dual import Outcome
 from kreps.app import cli, diagnosis, diagnosis_page, report
-from kreps.app import plots as plotting
 from kreps.app.diagnosis import Finding, Trend, diagnose, trend
 from kreps.app.run_folder import COLUMNS, NEWER, RunConfig, RunFolder, progress_row, rank_cap
 from kreps.envs.references import REFERENCE_REWARDS

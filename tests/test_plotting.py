@@ -9,15 +9,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
 import kreps
-from kreps.app import plots as plotting
+from kreps import plotting
+from kreps.app import plots
 from kreps.data.rollout import Rollout
 from kreps.data.task import TaskSpec
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import ConfigurationError
+from kreps.experiments import plots as experiment_plots
 
 REFERENCES = REFERENCE_REWARDS["kreps/SwingUp-v0"]
 LABELS = (["angle", "velocity"], ["torque"])
@@ -52,7 +55,7 @@ def texts(figure: Figure) -> str:
 
 
 def maps(learner: kreps.KREPS) -> Figure:
-    return plotting.policy_maps(learner.state, learner.task, *LABELS)
+    return plots.policy_maps(learner.state, learner.task, *LABELS)
 
 
 def film(learner: kreps.KREPS, path: Path, steps: int = 5, **changes: Any) -> Path:
@@ -68,14 +71,14 @@ def film(learner: kreps.KREPS, path: Path, steps: int = 5, **changes: Any) -> Pa
         "fps": 20.0,
         "path": path,
     }
-    return plotting.film(**{**arguments, **changes})
+    return plots.film(**{**arguments, **changes})
 
 
 # ---- learning curve ---------------------------------------------------------------------------
 
 
 def test_the_curve_shows_each_batch_at_the_data_its_policy_was_learnt_from() -> None:
-    figure = plotting.learning_curve(rows(3), {}, None, "title")
+    figure = plots.learning_curve(rows(3), {}, None, "title")
     top, middle, bottom = figure.axes
     np.testing.assert_array_equal(top.lines[0].get_xdata(), [0.0, 100.0, 200.0])
     np.testing.assert_array_equal(top.lines[0].get_ydata(), [-90.0, -80.0, -70.0])
@@ -86,7 +89,7 @@ def test_the_curve_shows_each_batch_at_the_data_its_policy_was_learnt_from() -> 
 
 
 def test_the_curve_names_every_reference_value_and_the_evaluation() -> None:
-    figure = plotting.learning_curve(rows(3), REFERENCES, EVALUATION, "title")
+    figure = plots.learning_curve(rows(3), REFERENCES, EVALUATION, "title")
     top = figure.axes[0]
     said = texts(figure)
     levels = [float(np.asarray(line.get_ydata())[0]) for line in top.lines]
@@ -105,7 +108,7 @@ def test_the_curve_names_every_reference_value_and_the_evaluation() -> None:
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_short_runs_have_a_curve_too(count: int, tmp_path: Path) -> None:
-    figure = plotting.learning_curve(rows(count), REFERENCES, EVALUATION, "short")
+    figure = plots.learning_curve(rows(count), REFERENCES, EVALUATION, "short")
     path = plotting.save(figure, tmp_path / "curve.png")
     with Image.open(path) as picture:
         picture.load()
@@ -113,8 +116,8 @@ def test_short_runs_have_a_curve_too(count: int, tmp_path: Path) -> None:
 
 
 def test_the_names_of_reference_lines_do_not_overlap() -> None:
-    figure = plotting.learning_curve(rows(3), REFERENCES, EVALUATION, "title")
-    canvas = plotting.FigureCanvasAgg(figure)
+    figure = plots.learning_curve(rows(3), REFERENCES, EVALUATION, "title")
+    canvas = FigureCanvasAgg(figure)
     canvas.draw()
     boxes = [t.get_window_extent(canvas.get_renderer()) for t in figure.axes[0].texts]
     assert len(boxes) == len(REFERENCES)
@@ -128,7 +131,7 @@ def test_drawing_leaves_the_settings_of_others_alone(learnt: kreps.KREPS, tmp_pa
     from matplotlib import rcParams
 
     before = dict(rcParams)
-    plotting.save(plotting.learning_curve(rows(2), {}, None, ""), tmp_path / "a.png")
+    plotting.save(plots.learning_curve(rows(2), {}, None, ""), tmp_path / "a.png")
     plotting.save(maps(learnt), tmp_path / "b.png")
     film(learnt, tmp_path / "c.gif", 2)
     assert dict(rcParams) == before
@@ -168,10 +171,10 @@ def test_the_maps_show_policy_and_value_over_the_plane(learnt: kreps.KREPS, tmp_
 def test_the_maps_draw_the_latest_roll_outs_without_lines_across_the_cut() -> None:
     task = TaskSpec(2, [-1.0], [1.0], (0,))
     observations = np.array([[4.4, 1.0], [4.6, 1.0], [-1.5, 1.0], [-1.3, 1.0]])
-    x, y = plotting._unwrapped(observations, task)
+    x, y = plots._unwrapped(observations, task)
     assert len(x) == 5 and np.isnan(x[2]) and np.isnan(y[2])
     np.testing.assert_array_equal(x[[0, 1, 3, 4]], observations[:, 0])
-    plain = plotting._unwrapped(observations, TaskSpec(2, [-1.0], [1.0]))
+    plain = plots._unwrapped(observations, TaskSpec(2, [-1.0], [1.0]))
     np.testing.assert_array_equal(plain, observations.T)  # a jump of a length is a jump
 
 
@@ -241,7 +244,7 @@ def test_a_comparison_shows_every_seed_and_their_mean(tmp_path: Path) -> None:
         for seed in (0, 1, 2)
         for iteration in (1, 2)
     ]
-    figure = plotting.comparison(
+    figure = experiment_plots.comparison(
         data, {"default": REFERENCES, "paper": REFERENCES}, "title", "source"
     )
     assert len(figure.axes) == 4
@@ -255,7 +258,7 @@ def test_a_comparison_shows_every_seed_and_their_mean(tmp_path: Path) -> None:
     plotting.save(figure, tmp_path / "comparison.png")
     one = [row for row in data if row["seed"] == 0]
     plotting.save(
-        plotting.comparison(
+        experiment_plots.comparison(
             one, {"default": {}, "paper": {"x": -60.0, "y": -80.0}}, "one seed", ""
         ),
         tmp_path / "one.png",
@@ -277,7 +280,7 @@ def test_learning_curves_show_means_and_level_lines(tmp_path: Path) -> None:
         for iteration in (1, 2)
     ]
     data += [{**row, "method": "once"} for row in data if row["iteration"] == 1]
-    figure = plotting.learning_curves(data, REFERENCES, "title", "source")
+    figure = experiment_plots.learning_curves(data, REFERENCES, "title", "source")
     training, stochastic, greedy = figure.axes
     of = {line.get_label(): line for line in stochastic.lines}
     np.testing.assert_allclose(np.asarray(of["A"].get_xdata(), dtype=float), [101.0, 201.0])

@@ -22,8 +22,8 @@ from matplotlib.ticker import (
 
 from kreps.app import diagnosis
 from kreps.app.diagnosis import Finding, Row, Severity, column
-from kreps.app.plots import BLUE, GREY, STYLE
 from kreps.errors import ConfigurationError
+from kreps.plotting import BLUE, GREY, STYLE
 
 COLOURS: dict[Severity, str] = {"limit": "#c0392b", "note": "#b07d10", "fine": "#2a8c7e"}
 PAGES = (".png", ".pdf", ".svg")

@@ -128,8 +128,8 @@ def diagnosis_of(folder: RunFolder) -> list[Finding]:
 
 
 def draw_diagnosis(folder: RunFolder, findings: list[Finding], path: Path) -> Path:
+    from kreps import plotting
     from kreps.app import diagnosis_page
-    from kreps.app import plots as plotting
 
     page = diagnosis_page.page(
         _rows(folder),
@@ -205,7 +205,8 @@ def _labels(env: Environment, task: TaskSpec) -> tuple[list[str], list[str]]:
 
 
 def plot_run(folder: RunFolder, learner: KREPS) -> list[Path]:
-    from kreps.app import plots as plotting
+    from kreps import plotting
+    from kreps.app import plots
 
     assert learner.env is not None
     rows = folder.rows()
@@ -213,12 +214,12 @@ def plot_run(folder: RunFolder, learner: KREPS) -> list[Path]:
         raise ConfigurationError(f"{folder.progress_file} holds no iteration to draw")
     evaluation = folder.evaluation(learner.state.iteration)
     with console.status("drawing ..."):
-        curve = plotting.learning_curve(
+        curve = plots.learning_curve(
             rows, _references(folder), evaluation, folder.config().environment
         )
         drawn = [plotting.save(curve, folder.path / "learning_curve.png")]
         if learner.task.observation_size == 2:
-            maps = plotting.policy_maps(
+            maps = plots.policy_maps(
                 learner.state, learner.task, *_labels(learner.env, learner.task)
             )
             drawn.append(plotting.save(maps, folder.path / "policy_maps.png"))
@@ -228,10 +229,10 @@ def plot_run(folder: RunFolder, learner: KREPS) -> list[Path]:
 def film_run(
     folder: RunFolder, learner: KREPS, steps: int, stochastic: bool, seed: int, out: Path | None
 ) -> Path:
-    from kreps.app import plots as plotting
+    from kreps.app import plots
 
     path = out or folder.path / "video.gif"
-    plotting.check_film_name(path)
+    plots.check_film_name(path)
     env = make_environment(folder.config().environment, render_mode="rgb_array")
     policy = Policy(learner.policy.process, seed)
     frames, observations, actions = [], [], []
@@ -255,7 +256,7 @@ def film_run(
             ) from error
         finally:
             env.close()
-        return plotting.film(
+        return plots.film(
             frames,
             observations=np.array(observations),
             actions=np.array(actions),

@@ -14,14 +14,9 @@ import csv
 import io
 import json
 import math
-import platform
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
-
-import numpy as np
-import scipy
 
 from kreps.algorithms.dual import Outcome
 from kreps.errors import ConfigurationError, StorageError
@@ -29,6 +24,7 @@ from kreps.learning.learner import KREPS, IterationReport
 from kreps.learning.progress import seconds_by_stage
 from kreps.learning.storage import save_policy, write_atomically
 from kreps.settings import RKHS, Settings
+from kreps.versions import versions
 
 STAGES = (
     "rollouts",
@@ -106,16 +102,6 @@ class RunConfig:
     preset: str
     settings: dict[str, Any]
     periodic: list[int] | None
-
-
-def versions() -> dict[str, str]:
-    """What the numbers depend on beyond the configuration."""
-    return {
-        "kreps": version("kreps"),
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        "python": platform.python_version(),
-    }
 
 
 class RunFolder:

@@ -12,7 +12,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from kreps.app.run_folder import versions
 from kreps.envs.image_swing_up import PIXELS
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.envs.swing_up import TIME_STEP
@@ -24,6 +23,7 @@ from kreps.learning.environment import task_of
 from kreps.learning.storage import write_atomically
 from kreps.policies.exploration import BangBang
 from kreps.seeding import Purpose, generator, integer_seed
+from kreps.versions import versions
 
 
 def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -169,7 +169,8 @@ def write_figure(
     folder: Path, name: str, command: str, results: Sequence[Mapping[str, Any]]
 ) -> list[Path]:
     """The result files of a figure, and its picture."""
-    from kreps.app import plots as plotting
+    from kreps import plotting
+    from kreps.experiments import plots
 
     write_results(folder, name, command, results)
     rows = named_rows(rows_of(results))
@@ -182,18 +183,19 @@ def write_figure(
     }
     source = f"{command}   (commit {commits_of(results)})"
     if name in SEED_BY_SEED:
-        figure = plotting.comparison(rows, references, TITLES[name], source)
+        figure = plots.comparison(rows, references, TITLES[name], source)
     else:
         some = next(iter(references.values()))
         known = list(METHODS) if rows[0]["method"] in METHODS else []
-        figure = plotting.learning_curves(rows, some, TITLES[name], source, known)
+        figure = plots.learning_curves(rows, some, TITLES[name], source, known)
     picture = plotting.save(figure, folder / f"{name}.png")
     return [folder / f"{name}.{ending}" for ending in ("csv", "json", "md")] + [picture]
 
 
 def draw_features(path: Path) -> Path:
     """Fig. 2a: what the learner sees of a roll-out of its first policy."""
-    from kreps.app import plots as plotting
+    from kreps import plotting
+    from kreps.experiments import plots
 
     env = gym.make("kreps/ImageSwingUp-v0")
     task = task_of(env)
@@ -202,7 +204,7 @@ def draw_features(path: Path) -> Path:
     (rollout,) = simulate(env, task, BangBang(task), seeds, noise)
     shown = np.arange(1, 41, 5)
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure = plotting.image_features(
+    figure = plots.image_features(
         rollout.observations[shown], [float(t * TIME_STEP) for t in shown], PIXELS
     )
     return plotting.save(figure, path)
