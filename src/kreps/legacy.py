@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 PRESET_NAMES = {"default": "model_based", "observed": "single_step"}
@@ -92,3 +92,16 @@ def checkpoint_settings(stored: Mapping[str, Any], method: str) -> dict[str, Any
     if method != "reps" or "rollout_lengths" in stored:
         return present_settings(stored)
     return present_settings({**ADDED_IN_0_1, **stored})
+
+
+PROGRESS_COLUMNS = {
+    "refused": "rejected",
+    "cpu_seconds_imagined_step": "cpu_seconds_generated_samples",
+    "cpu_seconds_judgement": "cpu_seconds_acceptance_test",
+}
+"""Columns of ``progress.csv`` of version 0.1 that have another name now."""
+
+
+def present_columns(columns: Sequence[str]) -> tuple[str, ...]:
+    """Columns of ``progress.csv``, of this or an earlier version, by their present names."""
+    return tuple(PROGRESS_COLUMNS.get(name, name) for name in columns)
