@@ -30,7 +30,7 @@ class Prepared:
         _, features = value_basis(self.transitions, self.kernel, self.settings)
         self.successors = successor_features(self.transitions, features)
         self.changes = self.successors - features[self.transitions.state]
-        actions = self.task.scaled(self.task.clip(self.transitions.actions))
+        actions = self.task.scaled_applied(self.transitions.actions)
         self.inputs = np.concatenate([self.transitions.states, actions], axis=1)
         factors = (*self.kernel.factors, SquaredExponential((self.inputs.shape[1] - 1,)))
         self.input_kernel = Kernel(factors, median_lengthscales(factors, self.inputs, RNG(1)))

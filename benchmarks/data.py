@@ -11,7 +11,7 @@ import numpy as np
 
 from kreps import KREPS, Rollout
 from kreps.algorithms.state import LearnerState
-from kreps.data.rollout import Transitions
+from kreps.data.rollouts import Transitions
 from kreps.kernels.threads import blas_threads
 from kreps.learning.collect import collect
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
@@ -91,7 +91,7 @@ def swing_up(n: int) -> SwingUpData:
         )
         left -= steps
     assert left == 0
-    return SwingUpData(learner, Transitions.of(kept))
+    return SwingUpData(learner, Transitions.from_rollouts(kept))
 
 
 @cache

@@ -35,7 +35,7 @@ from kreps.algorithms.dual import (
 )
 from kreps.algorithms.newton import solve_dual
 from kreps.algorithms.state import LearnerState
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.envs.restart import restart_length
@@ -295,7 +295,7 @@ assert isinstance(model, KernelEmbedding)
 expected = origin + model.expected_features(changes)  # a row E[phi(s') | s_i, a_i] per sample
 
 pair = np.array([[0.5, -1.0]])  # rad, rad/s
-in_units = np.column_stack([pair[:, :1], task.scaled(task.clip(pair[:, 1:]))])
+in_units = np.column_stack([pair[:, :1], task.scaled_applied(pair[:, 1:])])
 beta = model.strengths(in_units)[:, 0]
 
 goal = np.zeros((1, 1))

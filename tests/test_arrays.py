@@ -20,7 +20,7 @@ from kreps.algorithms.dual import Moments
 from kreps.algorithms.reps import UpdateInfo
 from kreps.data import dataset as dataset_module
 from kreps.data.compute import Compute
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.errors import NumericalError
 from kreps.kernels.arrays import (

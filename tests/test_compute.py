@@ -21,7 +21,7 @@ from kreps.algorithms import low_rank
 from kreps.data import dataset as dataset_module
 from kreps.data.compute import AHEAD, Compute
 from kreps.data.dataset import Dataset
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.errors import DataError
 from kreps.learning.collect import collect
@@ -186,7 +186,7 @@ def test_processes_learn_the_same_policy_to_the_last_byte(
 ) -> None:
     given: Dataset | list[Rollout] = {
         "list": lambda: rollouts,
-        "set": lambda: Dataset.of(rollouts),
+        "set": lambda: Dataset.from_rollouts(rollouts),
         "arrays": lambda: Dataset.from_arrays(
             np.concatenate([r.observations for r in rollouts]),
             np.concatenate([r.actions for r in rollouts]),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Kernel, Periodic, WrapAngle
@@ -32,7 +32,7 @@ def turning(begin: float, samples: int = 400, turns: float = 1.0) -> Transitions
     angles = begin + turns * TURN * rng.permutation(samples + 1) / (samples + 1)
     states = np.column_stack([angles, rng.normal(size=samples + 1)])
     rewards = -(states[:-1, 0] ** 2)
-    return Transitions.of([Rollout(states, rng.uniform(-1, 1, (samples, 1)), rewards)])
+    return Transitions.from_rollouts([Rollout(states, rng.uniform(-1, 1, (samples, 1)), rewards)])
 
 
 def kernels_of(data: Transitions, settings: kreps.Settings) -> tuple[Kernel, Kernel]:

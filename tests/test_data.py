@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError
@@ -133,7 +133,7 @@ def test_rows_collected_as_views_of_one_buffer_keep_their_own_values() -> None:
     for t in range(4):
         state[:] = t
         copies.append(Rollout(np.stack([state, state + 1.0]), np.zeros((1, 1)), np.zeros(1)))
-    data = Transitions.of(copies)
+    data = Transitions.from_rollouts(copies)
     np.testing.assert_array_equal(data.states[:, 0], [0.0, 1.0, 2.0, 3.0])
     np.testing.assert_array_equal(data.points[data.successor][:, 0], [1.0, 2.0, 3.0, 4.0])
 
@@ -163,7 +163,7 @@ def successor_pairs(rollouts: list[Rollout]) -> tuple[FloatArray, FloatArray]:
 @pytest.mark.parametrize("lengths", [[1], [1, 1, 1], [4], [3, 1, 5], [1, 6]])
 def test_transitions_name_each_state_and_its_true_successor(lengths: list[int]) -> None:
     rollouts = [rollout(steps, seed) for seed, steps in enumerate(lengths)]
-    data = Transitions.of(rollouts)
+    data = Transitions.from_rollouts(rollouts)
     states, successors = successor_pairs(rollouts)
     assert len(data) == sum(lengths)
     assert data.points.shape == (sum(lengths) + len(lengths), 3)
@@ -177,13 +177,13 @@ def test_transitions_name_each_state_and_its_true_successor(lengths: list[int]) 
 
 
 def test_within_a_rollout_the_successor_is_the_next_state() -> None:
-    data = Transitions.of([rollout(5, 0), rollout(4, 1)])
+    data = Transitions.from_rollouts([rollout(5, 0), rollout(4, 1)])
     following = np.flatnonzero(data.successor[:-1] == data.state[1:])
     np.testing.assert_array_equal(following, [0, 1, 2, 3, 5, 6, 7])  # not across the border
 
 
 def test_only_the_last_step_of_a_terminated_rollout_is_an_end() -> None:
-    data = Transitions.of(
+    data = Transitions.from_rollouts(
         [rollout(3, 0, terminated=True), rollout(2, 1), rollout(1, 2, terminated=True)]
     )
     np.testing.assert_array_equal(data.terminated, [False, False, True, False, False, True])
@@ -200,7 +200,9 @@ def test_the_window_forgets_the_oldest_rollouts() -> None:
     assert [len(r) for r in second.rollouts] == [2, 3, 4, 5]
     assert [len(r) for r in third.rollouts] == [4, 5, 6, 7]
     assert third.capacity == 4
-    np.testing.assert_array_equal(third.transitions.states, Transitions.of(rollouts[3:]).states)
+    np.testing.assert_array_equal(
+        third.transitions.states, Transitions.from_rollouts(rollouts[3:]).states
+    )
 
 
 def test_more_rollouts_than_the_window_holds_leave_the_latest() -> None:

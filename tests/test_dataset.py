@@ -14,7 +14,7 @@ import pytest
 import kreps
 from kreps.data import dataset as dataset_module
 from kreps.data.dataset import CHUNK, Dataset
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, DataError, StorageError
 from kreps.kernels.arrays import FloatArray
@@ -51,7 +51,7 @@ def arrays(rollouts: list[Rollout]) -> dict[str, Any]:
 
 
 def from_memory(_: Path) -> Dataset:
-    return Dataset.of(ROLLOUTS)
+    return Dataset.from_rollouts(ROLLOUTS)
 
 
 def from_arrays(_: Path) -> Dataset:
@@ -100,7 +100,7 @@ def test_every_form_holds_the_same_transitions(form: Form, tmp_path: Path) -> No
     assert len(found) == sum(LENGTHS) == 31
     parts = [chunk.load() for chunk in found.chunks]
     assert [len(part) for part in parts] == [len(chunk) for chunk in found.chunks]
-    assert_same(Transitions.concat(parts), Transitions.of(ROLLOUTS))
+    assert_same(Transitions.concat(parts), Transitions.from_rollouts(ROLLOUTS))
 
 
 @pytest.mark.parametrize("form", [from_memory, from_arrays])
@@ -121,12 +121,14 @@ def test_chunks_are_whole_rollouts_of_about_the_size_asked_for(
 
 def test_without_being_asked_a_small_set_is_one_chunk() -> None:
     assert CHUNK > 31
-    assert len(Dataset.of(ROLLOUTS).chunks) == 1
+    assert len(Dataset.from_rollouts(ROLLOUTS).chunks) == 1
 
 
 def test_rollouts_may_come_from_a_generator() -> None:
-    found = Dataset.of(rollout(3, seed=i) for i in range(4))
-    assert_same(found.chunks[0].load(), Transitions.of([rollout(3, seed=i) for i in range(4)]))
+    found = Dataset.from_rollouts(rollout(3, seed=i) for i in range(4))
+    assert_same(
+        found.chunks[0].load(), Transitions.from_rollouts([rollout(3, seed=i) for i in range(4)])
+    )
 
 
 def test_nothing_ends_where_nothing_is_said_to_end() -> None:
@@ -151,11 +153,11 @@ def test_arrays_on_disk_are_neither_read_before_they_are_needed_nor_written(tmp_
     data = found.chunks[0].load()
     assert not isinstance(data.points, np.memmap)
     data.points[:] = 0.0
-    assert_same(found.chunks[0].load(), Transitions.of(ROLLOUTS))
+    assert_same(found.chunks[0].load(), Transitions.from_rollouts(ROLLOUTS))
 
 
 def test_values_are_split_as_the_samples_are(short_chunks: None) -> None:
-    found = Dataset.of(ROLLOUTS)
+    found = Dataset.from_rollouts(ROLLOUTS)
     np.testing.assert_array_equal(found.offsets, [0, 12, 25, 31])
     parts = found.split(np.arange(31.0))
     assert [len(part) for part in parts] == [len(chunk) for chunk in found.chunks]
@@ -181,7 +183,7 @@ def test_some_samples_are_taken_from_wherever_they_are(
     rows: list[int], form: Form, tmp_path: Path
 ) -> None:
     found = form(tmp_path).take(np.array(rows))
-    whole = Transitions.of(ROLLOUTS)
+    whole = Transitions.from_rollouts(ROLLOUTS)
     np.testing.assert_array_equal(found.states, whole.states[rows])
     np.testing.assert_array_equal(
         found.points[found.successor], whole.points[whole.successor[rows]]
@@ -194,7 +196,9 @@ def test_some_samples_are_taken_from_wherever_they_are(
 
 
 def test_all_samples_are_the_transitions_themselves(short_chunks: None) -> None:
-    assert_same(Dataset.of(ROLLOUTS).take(np.arange(31)), Transitions.of(ROLLOUTS))
+    assert_same(
+        Dataset.from_rollouts(ROLLOUTS).take(np.arange(31)), Transitions.from_rollouts(ROLLOUTS)
+    )
 
 
 # ---- files ------------------------------------------------------------------------------------
@@ -277,7 +281,7 @@ def test_a_folder_without_rollouts_and_none_at_all_are_refused(tmp_path: Path) -
 
 def test_nothing_is_refused() -> None:
     with pytest.raises(DataError, match="at least one"):
-        Dataset.of([])
+        Dataset.from_rollouts([])
     with pytest.raises(DataError, match="at least one"):
         Dataset.from_arrays(np.empty((0, 3)), np.empty((0, 2)), np.empty(0), [])
 
@@ -339,31 +343,31 @@ def test_a_set_of_another_width_than_the_task_is_refused(
     elif form == "arrays":
         rejected(Dataset.from_arrays(**arrays(strangers)), reason)
     else:
-        rejected(Dataset.of(strangers), reason)
+        rejected(Dataset.from_rollouts(strangers), reason)
 
 
 @pytest.mark.parametrize(("ds", "da"), [(2, 2), (3, 1)])
 def test_rollouts_of_different_widths_are_refused(ds: int, da: int) -> None:
     with pytest.raises(DataError):
-        Dataset.of([*ROLLOUTS, rollout(4, ds=ds, da=da)])
+        Dataset.from_rollouts([*ROLLOUTS, rollout(4, ds=ds, da=da)])
 
 
 def test_what_is_no_rollout_is_refused_by_its_place() -> None:
     with pytest.raises(DataError, match="item 1 is a str"):
-        Dataset.of([ROLLOUTS[0], "rollout"])  # type: ignore[list-item]
+        Dataset.from_rollouts([ROLLOUTS[0], "rollout"])  # type: ignore[list-item]
 
 
 def test_an_exact_update_from_a_set_is_refused_with_the_remedy() -> None:
     learner = kreps.KREPS(TASK, approximation="exact")
     with pytest.raises(ConfigurationError, match="pivoted"):
-        learner.update(Dataset.of(ROLLOUTS))
+        learner.update(Dataset.from_rollouts(ROLLOUTS))
     assert learner.state.iteration == 0
 
 
 def test_methods_that_need_all_samples_at_once_refuse_a_set() -> None:
     for learner in (kreps.ValueIteration(TASK), kreps.NPALP(TASK)):
         with pytest.raises(DataError):
-            learner.update(Dataset.of(ROLLOUTS))  # type: ignore[arg-type]
+            learner.update(Dataset.from_rollouts(ROLLOUTS))  # type: ignore[arg-type]
 
 
 def values(found: Dataset) -> FloatArray:

@@ -7,7 +7,7 @@ import pytest
 
 import kreps
 from kreps.algorithms.streaming import FeatureChanges, PredictedSuccessors
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels import regression as embedding
 from kreps.kernels.arrays import FloatArray, as_float
@@ -41,7 +41,7 @@ def pushes(
             states.append(np.array([states[-1][0] + 0.3 * velocity, velocity]))
         rewards = np.zeros(steps)
         found.append(Rollout(np.array(states), actions, rewards, ended and number % 2 == 0))
-    return Transitions.of(found)
+    return Transitions.from_rollouts(found)
 
 
 def basis_of(data: Transitions, task: TaskSpec = TASK) -> tuple[Kernel, RKHSBasis, FloatArray]:
@@ -52,7 +52,7 @@ def basis_of(data: Transitions, task: TaskSpec = TASK) -> tuple[Kernel, RKHSBasi
 def test_angles_change_the_short_way_round() -> None:
     task = TaskSpec(2, np.array([-1.0]), np.array([1.0]), periodic=(0,))
     observations = np.array([[3.0, 3.0], [-3.0, -3.0], [3.0, 3.0]])
-    data = Transitions.of([Rollout(observations, np.zeros((2, 1)), np.zeros(2))])
+    data = Transitions.from_rollouts([Rollout(observations, np.zeros((2, 1)), np.zeros(2))])
     short = 2.0 * np.pi - 6.0
     np.testing.assert_allclose(state_changes(data, task), [[short, -6.0], [-short, 6.0]])
 
@@ -63,7 +63,9 @@ def test_coordinates_that_share_a_lengthscale_share_a_unit() -> None:
     observations[:, 0] = 0.0, 3.0, 0.0
     observations[:, 1] = 0.0, 4.0, 0.0
     observations[:, 2] = 0.0, 0.5, 1.0  # and the last one never moves
-    data = Transitions.of([Rollout(observations, np.zeros((2, 1)), np.zeros(2), terminated=True)])
+    data = Transitions.from_rollouts(
+        [Rollout(observations, np.zeros((2, 1)), np.zeros(2), terminated=True)]
+    )
     delta_targets = DeltaStateTargets.of(data, task)
     np.testing.assert_allclose(delta_targets.scale, [12.5**0.5, 12.5**0.5, 0.5, 1.0])
     targets = delta_targets.targets(data, task)
@@ -213,7 +215,7 @@ def test_ends_by_chance_are_expected_of_every_step() -> None:
         observations[1] = 0.9 * observations[0]
         ended = bool(rng.uniform() < 0.3)
         rollouts.append(Rollout(observations, rng.normal(size=(1, 1)), np.zeros(1), ended))
-    data = Transitions.of(rollouts)
+    data = Transitions.from_rollouts(rollouts)
     kernel, basis, features = basis_of(data)
     start = np.full(features.shape[1], 9.0)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
@@ -240,7 +242,7 @@ def test_the_end_of_a_task_is_foreseen() -> None:
         action = rng.uniform(-2.0, 2.0, size=(1, 1))
         observations[1] = observations[0] + [0.5 * action[0, 0], 0.0]
         rollouts.append(Rollout(observations, action, np.zeros(1), observations[1, 0] > 0.5))
-    data = Transitions.of(rollouts)
+    data = Transitions.from_rollouts(rollouts)
     kernel, basis, _ = basis_of(data)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
     far, near = (dynamics.regression(np.array([[0.0, 0.0, a]]))[0, -1] for a in (0.9, -0.9))
@@ -286,7 +288,7 @@ def test_chunks_are_told_of_the_observed_and_its_mirror_image(ended: bool) -> No
 def test_rounding_is_not_learnt() -> None:
     still = 1.0 + 3e-16 * np.random.default_rng(0).integers(-1, 2, size=(4, 1))
     observations = np.column_stack([np.arange(4.0), still])
-    data = Transitions.of([Rollout(observations, np.zeros((3, 1)), np.zeros(3))])
+    data = Transitions.from_rollouts([Rollout(observations, np.zeros((3, 1)), np.zeros(3))])
     np.testing.assert_allclose(DeltaStateTargets.of(data, TASK).scale, [1.0, 1.0])
 
 

@@ -11,7 +11,7 @@ import pytest
 
 import kreps
 from kreps.data.rewards import all_rollouts_informative, is_informative, reward_depends_on_state
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow, append, newest
 from kreps.policies.exploration import PINK, RED, WHITE, coloured_noise

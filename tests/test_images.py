@@ -13,7 +13,7 @@ from scipy.ndimage import gaussian_filter
 
 import kreps
 from kreps.algorithms import reps
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.envs.image_swing_up import PIXELS, image
 from kreps.errors import ConfigurationError, StorageError
@@ -283,11 +283,11 @@ def some_transitions(rng: np.random.Generator, far: float = 0.0) -> Transitions:
         steps = np.concatenate([actions, 0.3 * rng.normal(size=(10, 1))], axis=1)
         observations = shift + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
         rollouts.append(Rollout(observations, actions, -np.abs(observations[:-1, 0])))
-    return Transitions.of(rollouts)
+    return Transitions.from_rollouts(rollouts)
 
 
 def embedding_of(data: Transitions, regulariser: float) -> KernelEmbedding:
-    inputs = np.concatenate([data.states, TASK.scaled(TASK.clip(data.actions))], axis=1)
+    inputs = np.concatenate([data.states, TASK.scaled_applied(data.actions)], axis=1)
     return KernelEmbedding.fit(Kernel(factors_of(3), np.ones(3)), inputs, regulariser)
 
 

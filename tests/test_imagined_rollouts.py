@@ -22,7 +22,7 @@ from kreps.algorithms.acceptance import (
 )
 from kreps.algorithms.generated import generate
 from kreps.algorithms.reps import UpdateInfo
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Kernel
@@ -78,7 +78,7 @@ def model_env(
     step: FloatArray | None = None, end: float = 0.0, loo_residuals: float = 0.0, **changes: Any
 ) -> ModelEnv:
     """Of a process in which each action adds its size times a step to the state, and may end it."""
-    data = Transitions.of(turns())
+    data = Transitions.from_rollouts(turns())
     step = np.array([0.1, 0.02]) if step is None else step
     slopes = np.zeros((4, 3))
     slopes[3, :2] = step
@@ -200,14 +200,14 @@ def test_they_stay_in_the_range_of_the_data_but_angles_have_none() -> None:
 
 
 def test_images_and_few_samples_are_not_simulated() -> None:
-    data = Transitions.of(turns(2, 2 * SAMPLES_PER_COEFFICIENT))
+    data = Transitions.from_rollouts(turns(2, 2 * SAMPLES_PER_COEFFICIENT))
     assert len(data) == SAMPLES_PER_COEFFICIENT * (1 + 2 + 1)
     assert supports_model_rollouts(data, TASK)
     assert not supports_model_rollouts(
-        Transitions.of(turns(2, 2 * SAMPLES_PER_COEFFICIENT - 1)), TASK
+        Transitions.from_rollouts(turns(2, 2 * SAMPLES_PER_COEFFICIENT - 1)), TASK
     )
     image = TaskSpec(4, [-1.0], [1.0], groups=((0, 1, 2, 3),), image_shape=(2, 2))
-    plenty = Transitions.of(
+    plenty = Transitions.from_rollouts(
         [Rollout(np.zeros((5000, 4)), np.zeros((4999, 1)), np.zeros(4999))],
     )
     assert not supports_model_rollouts(plenty, image)
@@ -465,7 +465,7 @@ def test_targets_of_both_steps_make_the_policy() -> None:
 
 def test_a_policy_is_followed_and_not_the_roll_outs() -> None:
     """Pushed to one side in the model, all that it is led to lies on that side."""
-    data = Transitions.of(turns(20))
+    data = Transitions.from_rollouts(turns(20))
     rng = np.random.default_rng(9)
     settings = settings_of(exploring_starts=0.0)
     kernel = reps.state_kernel(data, TASK, rng)

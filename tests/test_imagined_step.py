@@ -27,7 +27,7 @@ from kreps.algorithms.reps import (
 )
 from kreps.algorithms.state import Stopwatch
 from kreps.data.dataset import Dataset
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels import regression as embedding
 from kreps.kernels.arrays import FloatArray, IntArray
@@ -152,7 +152,7 @@ class Case:
     def of(cls, **changes: Any) -> Case:
         rng = np.random.default_rng(5)
         settings = settings_of("default", **changes)
-        data = Transitions.of(pushes(terminated=True))
+        data = Transitions.from_rollouts(pushes(terminated=True))
         kernel = state_kernel(data, TASK, rng)
         basis, features = value_basis(data, kernel, settings)
         expectation = reps.expected_successors(
@@ -308,7 +308,7 @@ def errors_of_refits(model: KernelEmbedding, targets: FloatArray) -> FloatArray:
 def test_the_ridge_is_the_error_of_refits_without_each_sample(model: Any) -> None:
     rollouts = pushes(6, 12)
     _, info = updated(rollouts, model=model)
-    data = Transitions.of(rollouts)
+    data = Transitions.from_rollouts(rollouts)
     settings = settings_of()
     # the same factors, with the lengthscales that the update reports
     kernel = state_kernel(data, TASK, np.random.default_rng(0))
@@ -369,7 +369,7 @@ def test_without_a_model_there_is_neither_error_nor_second_step() -> None:
 
 
 def test_targets_are_the_weighted_means_of_the_actions_of_each_state() -> None:
-    data = Transitions.of(pushes(3, 8))
+    data = Transitions.from_rollouts(pushes(3, 8))
     task = TaskSpec(2, np.array([-2.0, 0.0]), np.array([2.0, 10.0]))
     rng = np.random.default_rng(9)
     rows = np.sort(rng.choice(len(data), 60))
@@ -399,7 +399,7 @@ def test_targets_are_the_weighted_means_of_the_actions_of_each_state() -> None:
 
 
 def test_of_one_action_in_each_state_nothing_is_lost() -> None:
-    data = Transitions.of(pushes(3, 8))
+    data = Transitions.from_rollouts(pushes(3, 8))
     p = np.random.default_rng(10).uniform(0.01, 2.0, len(data))
     p /= p.sum()
     n = len(data)
@@ -475,7 +475,7 @@ def test_a_set_of_samples_is_learnt_from_in_one_step(monkeypatch: pytest.MonkeyP
         raise AssertionError("nothing is imagined of a set")
 
     monkeypatch.setattr(low_rank, "imagine", never)
-    _, info = updated(Dataset.of(pushes()))
+    _, info = updated(Dataset.from_rollouts(pushes()))
     assert len(info.dual.weights) == info.samples == 120
     with pytest.raises(AssertionError, match="imagined"):
         updated(pushes(), approximation="pivoted")
@@ -597,7 +597,9 @@ def test_the_support_is_at_most_one_point_for_each_state() -> None:
 def test_the_spread_of_actions_within_a_state_is_unbiased() -> None:
     rng = np.random.default_rng(0)
     n, each = 3000, 3
-    data = Transitions.of([Rollout(rng.normal(size=(n + 1, 2)), np.zeros((n, 1)), np.zeros(n))])
+    data = Transitions.from_rollouts(
+        [Rollout(rng.normal(size=(n + 1, 2)), np.zeros((n, 1)), np.zeros(n))]
+    )
     rows = np.repeat(np.arange(n), each)
     actions = 2.0 * rng.normal(0.0, 0.3, size=(n * each, 1)) + 5.0 * data.states[rows, :1]
     problem = DualProblem(np.zeros(n * each), np.zeros((n * each, 1)), 1.0, 1.0, 0.1)

@@ -14,7 +14,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 import kreps
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import FloatArray

@@ -27,7 +27,7 @@ from kreps.algorithms.streaming import StreamedProblem
 from kreps.data import dataset as dataset_module
 from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError
 from kreps.kernels import regression as embedding
@@ -249,7 +249,7 @@ def test_sums_over_chunks_are_those_over_all_samples(
     settings = {"approximation": approximation} | LOW | VARIANTS[variant]
     whole = updated(rollouts, **settings)
     monkeypatch.setattr(dataset_module, "CHUNK", 60)
-    assert len(Dataset.of(rollouts).chunks) > 2
+    assert len(Dataset.from_rollouts(rollouts).chunks) > 2
     found = updated(rollouts, **settings)
     # What the order of summation does; random pivots are ill-conditioned. Measured:
     # 5e-10, 2e-9 and 2e-5.
@@ -392,7 +392,7 @@ def test_a_chunk_without_any_weight_says_nothing_of_the_policy(rollouts: list[Ro
     # The rewards of one chunk are so low that none of its samples is heard.
     bad = [replace(r, rewards=r.rewards - 1e4) for r in swing_ups(2, 3)]
     _, info = updated([*bad, *rollouts], approximation="pivoted", model="sample", **LOW)
-    dataset = Dataset.of([*bad, *rollouts])
+    dataset = Dataset.from_rollouts([*bad, *rollouts])
     first = dataset.split(info.dual.weights)[0]
     assert len(first) * first.max() < MIN_RELATIVE_WEIGHT
     assert info.dual.converged
@@ -418,7 +418,7 @@ def test_one_seed_gives_one_learner_to_the_last_byte(
 def test_a_set_of_the_same_rollouts_gives_the_same_policy(rollouts: list[Rollout]) -> None:
     listed, info = updated(rollouts, approximation="pivoted", **LOW)
     states = visited(rollouts)
-    found, _ = updated(Dataset.of(rollouts), **LOW)  # "auto" is pivoted for any set
+    found, _ = updated(Dataset.from_rollouts(rollouts), **LOW)  # "auto" is pivoted for any set
     np.testing.assert_array_equal(moments(found, states), moments(listed, states))
     arrays = Dataset.from_arrays(
         np.concatenate([r.observations for r in rollouts]),
@@ -451,7 +451,7 @@ def test_an_exact_update_is_never_approximated(
     learner, _ = updated(rollouts, approximation="exact")
     assert not isinstance(learner.policy.process, SparseGP)
     with pytest.raises(ConfigurationError, match="exact"):
-        learner.update(Dataset.of(rollouts))
+        learner.update(Dataset.from_rollouts(rollouts))
     assert learner.state.iteration == 1
 
 
@@ -459,7 +459,7 @@ def test_an_exact_update_is_never_approximated(
 def test_a_set_is_always_learnt_from_in_low_rank(
     approximation: str, rollouts: list[Rollout]
 ) -> None:
-    learner, _ = updated(Dataset.of(rollouts), approximation=approximation, **LOW)
+    learner, _ = updated(Dataset.from_rollouts(rollouts), approximation=approximation, **LOW)
     assert isinstance(learner.policy.process, SparseGP)
 
 
@@ -484,7 +484,7 @@ def test_a_short_window_forgets_in_low_rank_too(rollouts: list[Rollout]) -> None
 def test_a_set_is_counted_but_not_kept(rollouts: list[Rollout]) -> None:
     learner, _ = updated(rollouts[:2], approximation="pivoted", **LOW)
     kept = learner.state.window.rollouts
-    info = learner.update(Dataset.of(rollouts[2:]))
+    info = learner.update(Dataset.from_rollouts(rollouts[2:]))
     assert info.samples == sum(map(len, rollouts[2:]))
     assert learner.state.window.rollouts == kept
     state = learner.state
@@ -552,7 +552,7 @@ def test_a_resumed_learner_goes_on_to_the_same_bytes(approximation: str, tmp_pat
 
 def test_learning_goes_on_after_a_set(rollouts: list[Rollout], tmp_path: Path) -> None:
     learner = swing_up()
-    learner.update(Dataset.of(rollouts))
+    learner.update(Dataset.from_rollouts(rollouts))
     assert learner.state.window.rollouts == ()
     saved = content(learner, tmp_path)
     resumed = kreps.KREPS.resume(tmp_path / "checkpoint.safetensors", gym.make("kreps/SwingUp-v0"))

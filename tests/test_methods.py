@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError, StorageError
 from kreps.kernels.arrays import FloatArray

@@ -15,7 +15,7 @@ from scipy.spatial.distance import cdist
 from kreps.algorithms import npalp
 from kreps.algorithms.npalp import sample_bounds
 from kreps.algorithms.state import LearnerState
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray, IntArray
@@ -100,7 +100,7 @@ def linear_program(
 @pytest.mark.parametrize("slope", [0.2, 2.0, 20.0])
 @pytest.mark.parametrize("seed", range(4))
 def test_the_bounds_solve_the_linear_program(seed: int, slope: float) -> None:
-    data = Transitions.of(rollouts_of(seed))
+    data = Transitions.from_rollouts(rollouts_of(seed))
     distances = cdist(data.points, data.points)
     q, _, _ = sample_bounds(
         data.rewards, 0.9, slope * distances[np.ix_(data.successor, data.state)]
@@ -114,7 +114,7 @@ def test_the_bounds_solve_the_linear_program(seed: int, slope: float) -> None:
 def test_an_update_solves_the_linear_program_of_its_window(seed: int) -> None:
     rollouts = rollouts_of(seed, 2) + rollouts_of(seed + 100, 2, terminated=True)
     policy = learnt(rollouts, restart_probability=0.1, lipschitz=1.5)
-    data = Transitions.of(rollouts)
+    data = Transitions.from_rollouts(rollouts)
     successor = data.successor.copy()
     successor[[11, 15]] = 10, 15  # the real ends lead to their own start states
     points = policy.kernel.embed(data.points)
@@ -133,7 +133,7 @@ def test_an_update_solves_the_linear_program_of_its_window(seed: int) -> None:
 @pytest.mark.parametrize("slope", [0.0, 0.5, 10.0, 1e4])
 @pytest.mark.parametrize("gamma", [0.5, 0.98])
 def test_the_bounds_are_the_limit_of_fixed_point_iteration(gamma: float, slope: float) -> None:
-    data = Transitions.of(rollouts_of(7, 8, 10))
+    data = Transitions.from_rollouts(rollouts_of(7, 8, 10))
     costs = slope * cdist(data.points[data.successor], data.states)
     q, improvements, residual = sample_bounds(data.rewards, gamma, costs)
     wanted = np.zeros(len(q))

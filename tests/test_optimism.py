@@ -12,7 +12,7 @@ import pytest
 
 import kreps
 from kreps.algorithms.generated import generate
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Kernel
@@ -55,14 +55,14 @@ def test_nearly_all_samples_have_one_of_another_rollout_within_the_known_distanc
         for s in r.observations[:-1]
     ]
     similarity = np.exp(-np.array(nearest))
-    found = novelty_radius(model_env(Transitions.of(made)))
+    found = novelty_radius(model_env(Transitions.from_rollouts(made)))
     assert found == pytest.approx(-np.log(np.quantile(similarity, 0.1)), rel=1e-9)
     assert np.mean(np.array(nearest) <= found) == pytest.approx(0.9, abs=0.03)
 
 
 def test_samples_that_are_drawn_keep_their_rollouts() -> None:
     made = rollouts(40)
-    whole = Transitions.of(made)
+    whole = Transitions.from_rollouts(made)
     chosen = np.arange(0, len(whole), 3)
     sample = whole.rows(chosen)
     similarity = KERNEL.gram(sample.states, sample.states)
@@ -70,8 +70,8 @@ def test_samples_that_are_drawn_keep_their_rollouts() -> None:
     wanted = -np.log(np.quantile(similarity.max(axis=1), 0.1))
     assert novelty_radius(model_env(sample)) == pytest.approx(wanted, rel=1e-12)
     # the same roll-outs, drawn from chunk by chunk
-    first = Transitions.of(made[:20])
-    chunks = first, Transitions.of(made[20:])
+    first = Transitions.from_rollouts(made[:20])
+    chunks = first, Transitions.from_rollouts(made[20:])
     parts = [
         chunk.rows(chosen[(chosen >= i) & (chosen < i + len(chunk))] - i)
         for chunk, i in zip(chunks, (0, len(first)), strict=True)
@@ -82,7 +82,7 @@ def test_samples_that_are_drawn_keep_their_rollouts() -> None:
 
 
 def test_in_panels_it_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    data = model_env(Transitions.of(rollouts(9)))
+    data = model_env(Transitions.from_rollouts(rollouts(9)))
     whole = novelty_radius(data)
     monkeypatch.setattr("kreps.algorithms.optimism.BLOCK", 7)
     assert novelty_radius(data) == pytest.approx(whole, rel=1e-9)
@@ -158,14 +158,14 @@ def test_to_the_update_the_unknown_is_earned_at_once_and_followed_by_a_restart()
 
 
 def test_one_rollout_says_nothing_of_what_is_known() -> None:
-    alone = model_env(Transitions.of(rollouts(1)))
+    alone = model_env(Transitions.from_rollouts(rollouts(1)))
     assert novelty_radius(alone) is None
     assert novelty_bonus(alone, np.arange(3.0), np.ones(3) / 3, 0, kreps.Settings()) is None
 
 
 def test_equal_states_leave_an_edge_above_zero() -> None:
     same = [Rollout(np.zeros((4, 2)), np.zeros((3, 1)), np.zeros(3))] * 3
-    found = novelty_radius(model_env(Transitions.of(same)))
+    found = novelty_radius(model_env(Transitions.from_rollouts(same)))
     assert found is not None and found > 0.0
     novelty = NoveltyBonus(1.0, 0.0, found).novelty(np.array([1.0, 0.99, 0.0]))
     np.testing.assert_array_equal(novelty, [0.0, 1.0, 1.0])
@@ -205,7 +205,7 @@ def test_who_has_found_the_unknown_stays_there() -> None:
 
 
 def test_optimism_falls_at_each_update_and_ends() -> None:
-    data = model_env(Transitions.of(rollouts(5)))
+    data = model_env(Transitions.from_rollouts(rollouts(5)))
     settings = kreps.Settings(bonus=0.5)
     rewards, weights = np.arange(9.0), np.eye(9)[2]
     optimistic_reward = []
@@ -223,14 +223,14 @@ def test_optimism_falls_at_each_update_and_ends() -> None:
 
 
 def test_who_earns_the_best_hopes_for_no_less() -> None:
-    data = model_env(Transitions.of(rollouts(5)))
+    data = model_env(Transitions.from_rollouts(rollouts(5)))
     rewards, weights = np.array([0.0] * 99 + [100.0]), np.eye(100)[-1]
     bonus = novelty_bonus(data, rewards, weights, 0, kreps.Settings())
     assert bonus is not None and bonus.optimistic_reward == bonus.average_reward_ == 100.0
 
 
 def test_a_seldom_goal_is_not_hoped_for_everywhere() -> None:
-    data = model_env(Transitions.of(rollouts(5)))
+    data = model_env(Transitions.from_rollouts(rollouts(5)))
     often, seldom = np.array([0.0, 1.0] * 50), np.array([0.0] * 99 + [100.0])
     settings, weights = kreps.Settings(bonus=1.0), np.full(100, 0.01)
     hopes = [novelty_bonus(data, rewards, weights, 0, settings) for rewards in (often, seldom)]

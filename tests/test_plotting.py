@@ -16,7 +16,7 @@ from PIL import Image
 import kreps
 from kreps import plotting
 from kreps.app import plots
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import ConfigurationError

@@ -21,7 +21,7 @@ from kreps.algorithms.reps import (
     policy_hyperparameters,
     update,
 )
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.errors import DataError
@@ -494,7 +494,7 @@ def test_several_actions_of_unequal_scale_are_served(recipe: str) -> None:
 
 def transitions(terminated: bool) -> tuple[Transitions, FloatArray]:
     rollouts = collect(3, 4, terminated=terminated) + collect(1, 2, seed=3)
-    data = Transitions.of(rollouts)
+    data = Transitions.from_rollouts(rollouts)
     return data, np.random.default_rng(11).normal(size=(len(data.points), 5))
 
 

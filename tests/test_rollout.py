@@ -11,7 +11,7 @@ import pytest
 
 import kreps
 from kreps.algorithms.reps import LearnerState
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.envs.restart import stratified_lengths
 from kreps.envs.swing_up import SwingUp

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.hyperparameters import EmbeddingLoss, Prior
@@ -93,7 +93,7 @@ def test_a_fit_has_weights_a_prior_and_more_than_one_start(
     monkeypatch.setattr(transition_model, "minimise", spy)
     rng = np.random.default_rng(3)
     rollout = Rollout(rng.normal(size=(901, 2)), rng.normal(size=(900, 1)), np.zeros(900))
-    data = Transitions.of([rollout])
+    data = Transitions.from_rollouts([rollout])
     kernel = state_kernel(data, TASK, rng)
     targets = rng.normal(size=(900, 2)) ** 3
     _, regulariser, _ = embedding_hyperparameters(
@@ -125,7 +125,7 @@ def test_a_goal_in_eight_of_many_samples_is_learnt() -> None:
     actions = rng.uniform(-1.0, 1.0, size=(1500, 1))
     rewards = -0.1 * actions[:, 0] ** 2
     rewards[goals] += 100.0
-    data = Transitions.of([Rollout(states, actions, rewards)])
+    data = Transitions.from_rollouts([Rollout(states, actions, rewards)])
     kernel = state_kernel(data, TASK, rng)
     targets = (rewards - rewards.mean())[:, None] / rewards.std()
     asked = np.column_stack([rng.uniform(0.88, 0.98, 60), rng.uniform(-0.9, 0.9, (60, 2))])

@@ -15,7 +15,7 @@ from kreps.algorithms import value_iteration
 from kreps.algorithms.dual import standardise
 from kreps.algorithms.state import LearnerState
 from kreps.algorithms.value_iteration import TOLERANCE, candidate_actions, iterate_values
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.envs.swing_up import reward, wrap_angle
@@ -115,7 +115,7 @@ def brute_force(
 @pytest.mark.parametrize("temperature", [0.0, 0.7])
 def test_values_equal_those_of_brute_force(temperature: float) -> None:
     rollouts, gamma = rollouts_of(0), 0.7
-    data = Transitions.of(rollouts)
+    data = Transitions.from_rollouts(rollouts)
     rewards, unit = standardise(data.rewards)
     standard = [
         Rollout(r.observations, r.actions, (r.rewards - data.rewards.max()) / unit, r.terminated)
@@ -151,7 +151,7 @@ def test_the_policy_of_an_update_has_the_q_of_brute_force_in_units_of_the_reward
     )
     policy = state.policy
     assert isinstance(policy, SoftmaxPolicy)
-    data = Transitions.of(rollouts)
+    data = Transitions.from_rollouts(rollouts)
     *lengthscales, regulariser = info.embedding_parameters
     model = embedding_of(data, lengthscales, regulariser)
     candidates = np.linspace(-1.0, 1.0, 5)[:, None]
@@ -183,7 +183,7 @@ def test_a_chain_has_the_values_of_exact_dynamic_programming(temperature: float)
         rollouts.append(
             Rollout([[place], [after]], [[moves[j]]], [gain[place, j]], (place, j) == (3, 2))
         )
-    data = Transitions.of(rollouts)
+    data = Transitions.from_rollouts(rollouts)
     inputs = np.concatenate([data.states, data.actions], axis=1)
     kernel = Kernel((*task.state_factors, SquaredExponential((1,))), np.array([0.05, 0.05]))
     model = KernelEmbedding.fit(kernel, inputs, 1e-10)
@@ -209,7 +209,7 @@ def test_a_chain_has_the_values_of_exact_dynamic_programming(temperature: float)
 def test_expectations_that_are_none_do_not_blow_up() -> None:
     """Strengths that add up to more than 1 / gamma: without limits V would grow for ever."""
     rollouts, gamma = rollouts_of(6, 4, 10), 0.95
-    data = Transitions.of(rollouts)
+    data = Transitions.from_rollouts(rollouts)
     rewards, _ = standardise(data.rewards)
     model = embedding_of(data, [2.0, 2.0, 2.0], 1e-3)
     candidates = candidate_actions(TASK, 9)

@@ -24,7 +24,7 @@ from kreps.errors import (
 if TYPE_CHECKING:
     from kreps.data.compute import Compute
     from kreps.data.dataset import Dataset
-    from kreps.data.rollout import Rollout
+    from kreps.data.rollouts import Rollout
     from kreps.data.task import TaskSpec
     from kreps.envs.restart import RandomRestart
     from kreps.learning.learner import (
@@ -96,7 +96,7 @@ _HOMES = {
     "load_rollouts": "learning.storage",
     "rollout_folder": "learning.storage",
     "save_rollouts": "learning.storage",
-    "Rollout": "data.rollout",
+    "Rollout": "data.rollouts",
     "TaskSpec": "data.task",
 }
 

@@ -17,7 +17,7 @@ from kreps.algorithms.policy_targets import (
 )
 from kreps.algorithms.reps import Expectation, ValueFeatures, stationarity_ridge
 from kreps.algorithms.state import Stopwatch, exact_transitions
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis

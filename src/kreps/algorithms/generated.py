@@ -100,7 +100,7 @@ def generate(
     std_scale = proposal_std_scale(tested, model_based)
     noise = std_scale * rng.standard_normal((count, task.action_size))
     actions = policy.act(states[state_of], noise)
-    inputs = np.concatenate([states[state_of], task.scaled(task.clip(actions))], axis=1)
+    inputs = np.concatenate([states[state_of], task.scaled_applied(actions)], axis=1)
     p = settings.restart_probability
     rewards, expected = expected_outcomes(world, rows[state_of], inputs, p)
     problem = DualProblem(

@@ -45,7 +45,7 @@ from kreps.algorithms.streaming import (
 )
 from kreps.data.compute import Compute
 from kreps.data.dataset import Chunk, Dataset
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray, IntArray, as_float
 from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis
@@ -115,7 +115,9 @@ class LowRankBatch:
         self.low_rank, self.compute = low_rank, compute
         self.jitters: list[float] = []
         self.from_dataset = isinstance(samples, Dataset)
-        self.dataset = samples if isinstance(samples, Dataset) else Dataset.of(window.rollouts)
+        self.dataset = (
+            samples if isinstance(samples, Dataset) else Dataset.from_rollouts(window.rollouts)
+        )
         self.size = len(self.dataset)
         read = list(compute.map(ChunkRewards(self.task), self.dataset.chunks))
         self.all_rewards, self.reward_unit = standardise(

@@ -18,7 +18,7 @@ from scipy.sparse.linalg import spsolve
 
 from kreps.algorithms.dual import standardise
 from kreps.algorithms.state import LearnerState, Stopwatch, exact_transitions
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.models.transition import state_kernel

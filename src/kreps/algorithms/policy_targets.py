@@ -9,7 +9,7 @@ import numpy as np
 
 from kreps.algorithms.dual import effective_sample_size
 from kreps.algorithms.generated import GeneratedSamples
-from kreps.data.rollout import Transitions
+from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.hyperparameters import PolicyLoss, Prior, factor_distances, minimise

@@ -16,7 +16,7 @@ import numpy as np
 from kreps.algorithms.dual import DualSolution, Problem
 from kreps.algorithms.policy_targets import PolicyFit, PolicyTargets
 from kreps.algorithms.state import LearnerState, Stopwatch
-from kreps.data.rollout import Transitions
+from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray, IntArray

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import FloatArray

@@ -16,7 +16,7 @@ import numpy as np
 from kreps.algorithms.dual import Moments
 from kreps.data.compute import Compute
 from kreps.data.dataset import Chunk, Dataset
-from kreps.data.rollout import Transitions
+from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.errors import DataError
 from kreps.kernels.arrays import Array, FloatArray, as_numpy, like, namespace, rows

@@ -21,7 +21,7 @@ from kreps.algorithms.reps import Batch, Step, reps_step, stationarity_ridge
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.errors import ConfigurationError
 from kreps.settings import Settings
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from kreps.algorithms.dual import standardise
 from kreps.algorithms.state import LearnerState, Stopwatch, exact_transitions
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import FloatArray, grid_points

@@ -9,7 +9,7 @@ from typing import Protocol
 
 import numpy as np
 
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import is_sane
 from kreps.errors import DataError
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
@@ -40,7 +40,7 @@ class RolloutChunk:
         return sum(len(rollout) for rollout in self.rollouts)
 
     def load(self) -> Transitions:
-        return Transitions.of(self.rollouts)
+        return Transitions.from_rollouts(self.rollouts)
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class ArrayChunk:
 class Dataset:
     """Chunks of whole roll-outs: in memory, memory-mapped, or a folder of files.
 
-    See `Dataset.of`, `Dataset.from_arrays` and `kreps.rollout_folder`.
+    See `Dataset.from_rollouts`, `Dataset.from_arrays` and `kreps.rollout_folder`.
     """
 
     chunks: tuple[Chunk, ...]
@@ -86,14 +86,16 @@ class Dataset:
             raise DataError("there is no roll-out to learn from; give at least one")
 
     @classmethod
-    def of(cls, rollouts: Iterable[Rollout]) -> Dataset:
+    def from_rollouts(cls, rollouts: Iterable[Rollout]) -> Dataset:
         """Roll-outs in memory.
 
         Raises:
             DataError: none, something that is no roll-out, or different widths.
         """
         if isinstance(rollouts, Rollout):
-            raise DataError("a data set has several roll-outs; write Dataset.of([rollout])")
+            raise DataError(
+                "a data set has several roll-outs; write Dataset.from_rollouts([rollout])"
+            )
         groups: list[list[Rollout]] = []
         size, widths = CHUNK, None
         for number, rollout in enumerate(rollouts):

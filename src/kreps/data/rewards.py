@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 
@@ -26,8 +26,8 @@ def reward_depends_on_state(rollouts: Sequence[Rollout], task: TaskSpec) -> bool
     tolerance = REWARD_RTOL * np.abs(rewards).max()
     if np.ptp(rewards) <= tolerance:
         return False
-    actions = task.scaled(task.clip(np.concatenate([rollout.actions for rollout in rollouts])))
-    zero = task.scaled(task.clip(np.zeros((1, task.action_size))))
+    actions = task.scaled_applied(np.concatenate([rollout.actions for rollout in rollouts]))
+    zero = task.scaled_applied(np.zeros((1, task.action_size)))
     terms, terms_of_zero = quadratic_terms(actions), quadratic_terms(zero)
     if len(terms) <= terms.shape[1]:  # a quadratic fits so few rewards exactly, whatever they are
         return True

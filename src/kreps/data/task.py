@@ -144,3 +144,7 @@ class TaskSpec:
     def clip(self, actions: FloatArray) -> FloatArray:
         """The *applied* actions: what the actuators make of the commanded ones."""
         return np.clip(actions, self.action_low, self.action_high)
+
+    def scaled_applied(self, actions: FloatArray) -> FloatArray:
+        """The applied actions of the commanded ones (m, da), in units of the action scale."""
+        return self.scaled(self.clip(actions))

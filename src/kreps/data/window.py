@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from kreps.data.rewards import is_informative, is_long_enough, reward_depends_on_state
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 
 RESERVED = 3
@@ -95,4 +95,4 @@ class ReplayWindow:
 
     @cached_property
     def transitions(self) -> Transitions:
-        return Transitions.of(self.rollouts)
+        return Transitions.from_rollouts(self.rollouts)

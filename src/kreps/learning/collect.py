@@ -12,7 +12,7 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import LARGEST, TaskSpec, is_sane
 from kreps.envs.batch import BatchModel, SettableModel
 from kreps.envs.restart import restart_length, stratified_lengths

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.collect import simulate

@@ -19,7 +19,7 @@ from kreps.algorithms.state import LearnerState, UpdateReport
 from kreps.algorithms.update import update as reps_update
 from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
-from kreps.data.rollout import Rollout
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError

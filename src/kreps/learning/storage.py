@@ -21,7 +21,7 @@ import safetensors.numpy
 
 from kreps.algorithms.state import LearnerState
 from kreps.data.dataset import Dataset
-from kreps.data.rollout import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec, is_sane
 from kreps.data.window import ReplayWindow
 from kreps.errors import KrepsError, StorageError
@@ -539,7 +539,7 @@ def save_rollouts(rollouts: Iterable[Rollout], path: str | Path) -> None:
         StorageError: the file cannot be written.
     """
     rollouts = list(rollouts) if not isinstance(rollouts, Rollout) else [rollouts]
-    Dataset.of(rollouts)  # complains
+    Dataset.from_rollouts(rollouts)  # complains
     samples = sum(len(r) for r in rollouts)
     write_arrays(Path(path), "rollouts", _rollout_parts(rollouts), {"samples": samples})
 

@@ -24,7 +24,7 @@ from functools import cached_property
 
 import numpy as np
 
-from kreps.data.rollout import Transitions
+from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import Array, FloatArray, IntArray, columns, like
 from kreps.kernels.basis import Basis

@@ -14,7 +14,7 @@ from math import ceil
 
 import numpy as np
 
-from kreps.data.rollout import Transitions
+from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
 from kreps.kernels.gram import PANEL
@@ -219,7 +219,7 @@ class ModelEnv:
     ) -> ModelStep:
         """One step from states (m, ds); starts after ends and restarts are left to the caller."""
         nearest, similarity = self.nearest(states)
-        actions = self.task.scaled(self.task.clip(act(states, noise.action_noise)))
+        actions = self.task.scaled_applied(act(states, noise.action_noise))
         inputs = np.concatenate([states, actions], axis=1)
         successors, ends = self.dynamics.sample(nearest, inputs, noise.residual_signs)
         successors = np.clip(successors, *self._range)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from kreps.data.rollout import Transitions
+from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.hyperparameters import EmbeddingLoss, Prior, factor_distances, minimise
@@ -100,7 +100,7 @@ def feature_differences(
 
 def state_actions(data: Transitions, task: TaskSpec) -> FloatArray:
     """States and applied actions side by side, (n, ds + da), actions in units of their scale."""
-    return np.concatenate([data.states, task.scaled(task.clip(data.actions))], axis=1)
+    return np.concatenate([data.states, task.scaled_applied(data.actions)], axis=1)
 
 
 def embedding_hyperparameters(

@@ -107,7 +107,7 @@ class Transitions:
         return self.points[self.state]
 
     @classmethod
-    def of(cls, rollouts: Sequence[Rollout]) -> Transitions:
+    def from_rollouts(cls, rollouts: Sequence[Rollout]) -> Transitions:
         """Flatten at least one roll-out."""
         return cls.from_arrays(
             np.concatenate([r.observations for r in rollouts]),
