@@ -27,7 +27,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import kreps
-from kreps.data.dataset import CHUNK
+from kreps.data.compute import CHUNK_SIZE
 from kreps.data.task import TaskSpec
 from kreps.experiments.runner import commit
 from kreps.experiments.tables import markdown
@@ -287,7 +287,7 @@ def scale(out: Path, largest: int) -> None:
             for row in rows
         ],
     )
-    content = {"chunk": CHUNK, "slopes_from_30000": slopes, "rows": found}
+    content = {"chunk": CHUNK_SIZE, "slopes_from_30000": slopes, "rows": found}
     write(out, "scale", content, figure, table)
 
 

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 import kreps
 from kreps.algorithms import low_rank
 from kreps.data import dataset as dataset_module
-from kreps.data.compute import AHEAD, Compute
+from kreps.data.compute import MAX_PENDING, Compute
 from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
@@ -67,7 +67,9 @@ def test_results_come_in_the_order_of_the_arguments_whoever_was_first(threads: E
 
 
 @pytest.mark.parametrize("executor", [None, Recorder()], ids=["here", "executor"])
-@pytest.mark.parametrize("count", [0, 1, AHEAD - 1, AHEAD, AHEAD + 1, 3 * AHEAD])
+@pytest.mark.parametrize(
+    "count", [0, 1, MAX_PENDING - 1, MAX_PENDING, MAX_PENDING + 1, 3 * MAX_PENDING]
+)
 def test_every_argument_has_its_result(executor: Executor | None, count: int) -> None:
     assert list(Compute(executor).map(str, range(count))) == [str(i) for i in range(count)]
 
@@ -76,13 +78,13 @@ def test_no_more_chunks_are_under_way_than_agreed() -> None:
     recorder, asked = Recorder(), []
 
     def arguments() -> Iterator[int]:
-        for i in range(5 * AHEAD):
+        for i in range(5 * MAX_PENDING):
             asked.append(i)
             yield i
 
     results = Compute(recorder).map(abs, arguments())
-    for taken in range(5 * AHEAD):
-        assert recorder.submitted == min(taken + AHEAD - 1 if taken else 0, 5 * AHEAD)
+    for taken in range(5 * MAX_PENDING):
+        assert recorder.submitted == min(taken + MAX_PENDING - 1 if taken else 0, 5 * MAX_PENDING)
         assert len(asked) == recorder.submitted  # not even the arguments are made before
         next(results)
 
@@ -100,7 +102,7 @@ def test_no_more_workers_are_busy_than_agreed(threads: Executor) -> None:
             busy -= 1
 
     list(Compute(threads).map(work, range(100)))
-    assert 2 <= most <= AHEAD
+    assert 2 <= most <= MAX_PENDING
 
 
 @pytest.mark.parametrize("where", ["here", "threads"])

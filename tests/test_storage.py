@@ -778,7 +778,7 @@ def test_impossible_lengths_of_rollouts_are_refused(
     changed[0] += changed[1] - lengths[0]  # the sum stays right
     changed[1] = lengths[0]
     message = checkpoint.refused_with(tmp_path / "x", {**tensors, "window.lengths": changed})
-    assert "lengths of its roll-outs" in message
+    assert "lengths" in message and "do not fit together" in message
 
 
 # ---- hostile headers --------------------------------------------------------------------------

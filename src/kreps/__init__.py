@@ -24,7 +24,7 @@ from kreps.errors import (
 if TYPE_CHECKING:
     from kreps.data.compute import Compute
     from kreps.data.dataset import Dataset
-    from kreps.data.rollouts import Rollout
+    from kreps.data.rollouts import Rollout, Rollouts
     from kreps.data.task import TaskSpec
     from kreps.envs.restart import RandomRestart
     from kreps.learning.learner import (
@@ -60,6 +60,7 @@ __all__ = [
     "Policy",
     "RandomRestart",
     "Rollout",
+    "Rollouts",
     "Settings",
     "SpaceError",
     "StorageError",
@@ -97,6 +98,7 @@ _HOMES = {
     "rollout_folder": "learning.storage",
     "save_rollouts": "learning.storage",
     "Rollout": "data.rollouts",
+    "Rollouts": "data.rollouts",
     "TaskSpec": "data.task",
 }
 

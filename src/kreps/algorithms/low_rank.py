@@ -115,9 +115,10 @@ class LowRankBatch:
         self.low_rank, self.compute = low_rank, compute
         self.jitters: list[float] = []
         self.from_dataset = isinstance(samples, Dataset)
-        self.dataset = (
-            samples if isinstance(samples, Dataset) else Dataset.from_rollouts(window.rollouts)
-        )
+        if isinstance(samples, Dataset):
+            self.dataset = samples
+        else:
+            self.dataset = Dataset.from_rollouts(window.rollouts, chunk_size=compute.chunk_size)
         self.size = len(self.dataset)
         read = list(compute.map(ChunkRewards(self.task), self.dataset.chunks))
         self.all_rewards, self.reward_unit = standardise(

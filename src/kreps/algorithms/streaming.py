@@ -39,7 +39,7 @@ class ChunkRewards:
     task: TaskSpec
 
     def __call__(self, chunk: Chunk) -> tuple[FloatArray, int]:
-        data = chunk.load()
+        data = chunk.load().transitions
         found = data.points.shape[1], data.actions.shape[1]
         wanted = self.task.observation_size, self.task.action_size
         if found != wanted:
@@ -59,7 +59,7 @@ class StartFeatures:
 
     def __call__(self, chunk: Chunk) -> FloatArray:
         """Both in one, (r + 1,)."""
-        data = chunk.load()
+        data = chunk.load().transitions
         phi = as_numpy(self.basis.features(self.to_device(data.points[data.start])))
         return np.append(phi.sum(axis=0), len(phi))
 
@@ -111,7 +111,7 @@ class EmbeddingSums:
     relative_to_state: bool
 
     def __call__(self, chunk: Chunk) -> RegressionSums:
-        data = chunk.load()
+        data = chunk.load().transitions
         own, after = self.changes.both(data)
         psi = self.embedded.features(self.changes.to_device(state_actions(data, self.task)))
         return RegressionSums.of(psi, after - own if self.relative_to_state else after)
@@ -127,7 +127,7 @@ class DeltaStateSums:
     to_device: ToDevice
 
     def __call__(self, chunk: Chunk) -> RegressionSums:
-        data = chunk.load()
+        data = chunk.load().transitions
         psi = self.embedded.features(self.to_device(state_actions(data, self.task)))
         return RegressionSums.of(psi, self.to_device(self.delta_targets.targets(data, self.task)))
 
@@ -231,7 +231,7 @@ class ChunkMoments:
     scatter: bool
 
     def __call__(self, chunk: Chunk, rewards: FloatArray) -> Moments:
-        b = self.rows(chunk.load())
+        b = self.rows(chunk.load().transitions)
         delta = like(rewards, b) + b @ like(self.theta, b)
         return Moments.of(delta, b, self.eta, scatter=self.scatter)
 
@@ -244,7 +244,7 @@ class ChunkErrors:
     theta: FloatArray
 
     def __call__(self, chunk: Chunk, rewards: FloatArray) -> FloatArray:
-        b = self.rows(chunk.load())
+        b = self.rows(chunk.load().transitions)
         return rewards + as_numpy(b @ like(self.theta, b))
 
 
@@ -298,7 +298,7 @@ class ChunkPolicySums:
     to_device: ToDevice
 
     def __call__(self, chunk: Chunk, weights: FloatArray) -> PolicySums:
-        data = chunk.load()
+        data = chunk.load().transitions
         kept = np.flatnonzero(weights)
         z = self.basis.features(self.to_device(data.states[kept]))
         targets = self.task.scaled(data.actions[kept])

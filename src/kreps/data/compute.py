@@ -1,4 +1,4 @@
-"""Where sums over many samples are computed: here, on an executor's workers, on another device."""
+"""Where sums over chunks of samples are computed: by an executor's workers, on another device."""
 
 from __future__ import annotations
 
@@ -14,38 +14,46 @@ from kreps.kernels.threads import blas_threads
 
 Result = TypeVar("Result")
 
-AHEAD = 16
-"""Chunks under way at once: enough for the workers of one machine, few enough for its memory."""
+CHUNK_SIZE = 8192
+"""Samples per chunk, about: 64 MB for each 1000 features."""
+
+MAX_PENDING = 16
+"""Chunks submitted and not yet collected: enough for the workers of one machine, few enough for its
+memory."""
 
 
 @dataclass(frozen=True)
 class Compute:
-    """How chunks of samples are worked on.
+    """Where and in which parts sums over samples are computed.
 
     Attributes:
         executor: any `concurrent.futures.Executor`, such as a process pool or a Dask client's
-            ``get_executor()``; None works in this process.  Each worker process uses one BLAS
+            ``get_executor()``; None computes in this process.  Each worker process uses one BLAS
             thread; a thread pool shares those of this process.
-        to_device: makes the arrays that the work is done in, such as ``cupy.asarray``; must be
-            picklable if there is an executor.  By default NumPy.
+        to_device: converts a NumPy array to the type that is computed with, such as
+            ``cupy.asarray``; must be picklable if there is an executor.  By default NumPy.
+        chunk_size: samples per chunk of the replay window, about: a chunk ends with the rollout
+            that fills so many.  It changes the last bits of sums.  A `kreps.Dataset` has chunks of
+            its own.
     """
 
     executor: Executor | None = None
     to_device: Callable[[FloatArray], Array] = as_float
+    chunk_size: int = CHUNK_SIZE
 
     def map(self, function: Callable[..., Result], *arguments: Iterable[Any]) -> Iterator[Result]:
-        """Results in the order of the arguments, whoever was first: so sums never differ."""
+        """The results in the order of the arguments, so that sums do not depend on timing."""
         if self.executor is None:
             yield from map(function, *arguments)
             return
-        # threads share this process's BLAS, and would undo each other's limits
-        elsewhere = not isinstance(self.executor, ThreadPoolExecutor)
-        work = partial(_on_one_thread, function) if elsewhere else function
+        # threads share the BLAS of this process and would override each other's limits
+        other_process = not isinstance(self.executor, ThreadPoolExecutor)
+        work = partial(_on_one_thread, function) if other_process else function
         pending: deque[Future[Result]] = deque()
         try:
             for each in zip(*arguments, strict=True):
                 pending.append(self.executor.submit(work, *each))
-                if len(pending) == AHEAD:
+                if len(pending) == MAX_PENDING:
                     yield pending.popleft().result()
             while pending:
                 yield pending.popleft().result()

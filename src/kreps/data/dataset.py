@@ -9,72 +9,45 @@ from typing import Protocol
 
 import numpy as np
 
-from kreps.data.rollouts import Rollout, Transitions
-from kreps.data.task import is_sane
-from kreps.errors import DataError
+from kreps.data.compute import CHUNK_SIZE
+from kreps.data.rollouts import Rollout, Rollouts, Transitions
+from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
-
-CHUNK = 8192
-"""Samples per chunk, about: 64 MB for each 1000 features."""
 
 
 class Chunk(Protocol):
-    """Some whole roll-outs, to be read when they are needed, perhaps by another process."""
+    """Some whole rollouts, read when they are needed, perhaps by another process.
 
-    def __len__(self) -> int:
+    Implemented by `Rollouts` in memory, `ArrayChunk` and `kreps.learning.storage.RolloutFile`.
+    """
+
+    @property
+    def steps(self) -> int:
         """Number of samples."""
         ...
 
-    def load(self) -> Transitions:
-        """The transitions."""
+    def load(self) -> Rollouts:
+        """The rollouts in memory, with their values checked."""
         ...
-
-
-@dataclass(frozen=True)
-class RolloutChunk:
-    """Roll-outs in memory."""
-
-    rollouts: tuple[Rollout, ...]
-
-    def __len__(self) -> int:
-        return sum(len(rollout) for rollout in self.rollouts)
-
-    def load(self) -> Transitions:
-        return Transitions.from_rollouts(self.rollouts)
 
 
 @dataclass(frozen=True)
 class ArrayChunk:
-    """Roll-outs laid end to end in arrays, which may be memory-mapped."""
+    """Rollouts in arrays whose values are read and checked by each `load`, such as memory maps."""
 
-    observations: FloatArray
-    actions: FloatArray
-    rewards: FloatArray
-    lengths: IntArray
-    terminated: BoolArray
+    unread: Rollouts
 
-    def __len__(self) -> int:
-        return len(self.rewards)
+    @property
+    def steps(self) -> int:
+        return self.unread.steps
 
-    def load(self) -> Transitions:
-        values = [
-            np.array(each, dtype=np.float64)  # off the disk, once
-            for each in (self.observations, self.actions, self.rewards)
-        ]
-        for name, each in zip(("observations", "actions", "rewards"), values, strict=True):
-            if not is_sane(each).all():
-                row = int(np.argwhere(~is_sane(each))[0, 0])
-                raise DataError(
-                    f"{name} hold NaN, an infinity or an absurdly large number, first in row {row} "
-                    f"of a chunk of {len(each)}; leave that roll-out out"
-                )
-        points, actions, rewards = values
-        return Transitions.from_arrays(points, actions, rewards, self.lengths, self.terminated)
+    def load(self) -> Rollouts:
+        return self.unread.read()
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """Chunks of whole roll-outs: in memory, memory-mapped, or a folder of files.
+    """Chunks of whole rollouts: in memory, memory-mapped, or a folder of files.
 
     See `Dataset.from_rollouts`, `Dataset.from_arrays` and `kreps.rollout_folder`.
     """
@@ -83,37 +56,21 @@ class Dataset:
 
     def __post_init__(self) -> None:
         if not self.chunks:
-            raise DataError("there is no roll-out to learn from; give at least one")
+            raise DataError("there is no rollout to learn from; give at least one")
 
     @classmethod
-    def from_rollouts(cls, rollouts: Iterable[Rollout]) -> Dataset:
-        """Roll-outs in memory.
+    def from_rollouts(cls, rollouts: Iterable[Rollout], *, chunk_size: int = CHUNK_SIZE) -> Dataset:
+        """Rollouts in memory.
+
+        Args:
+            rollouts: at least one.
+            chunk_size: a chunk ends with the rollout that fills this many samples.
 
         Raises:
-            DataError: none, something that is no roll-out, or different widths.
+            DataError: no rollout, something that is no rollout, or different widths.
         """
-        if isinstance(rollouts, Rollout):
-            raise DataError(
-                "a data set has several roll-outs; write Dataset.from_rollouts([rollout])"
-            )
-        groups: list[list[Rollout]] = []
-        size, widths = CHUNK, None
-        for number, rollout in enumerate(rollouts):
-            if not isinstance(rollout, Rollout):
-                raise DataError(f"item {number} is a {type(rollout).__name__}, not a kreps.Rollout")
-            found = rollout.observations.shape[1], rollout.actions.shape[1]
-            widths = widths or found
-            if found != widths:
-                raise DataError(
-                    f"roll-out {number} has (observation, action) coordinates {found}, those "
-                    f"before it {widths}; make a data set of each task's"
-                )
-            if size >= CHUNK:
-                groups.append([])
-                size = 0
-            groups[-1].append(rollout)
-            size += len(rollout)
-        return cls(tuple(RolloutChunk(tuple(group)) for group in groups))
+        flat = Rollouts.from_list(rollouts)
+        return cls(tuple(flat[part] for part in chunk_slices(flat.offsets, chunk_size)))
 
     @classmethod
     def from_arrays(
@@ -123,60 +80,25 @@ class Dataset:
         rewards: FloatArray,
         lengths: Sequence[int] | IntArray,
         terminated: Sequence[bool] | BoolArray | None = None,
+        *,
+        chunk_size: int = CHUNK_SIZE,
     ) -> Dataset:
-        """R roll-outs laid end to end in arrays, such as ``np.load(path, mmap_mode="r")``.
+        """R rollouts laid end to end in arrays, such as ``np.load(path, mmap_mode="r")``.
 
         Args:
-            observations: (n + R, ds), those of each roll-out followed by its last successor.
+            observations: (n + R, ds), those of each rollout followed by its last successor.
             actions: (n, da) as commanded.
             rewards: (n,).
-            lengths: (R,) steps of each roll-out.
-            terminated: (R,) whether each really ended the task; None if none did.
+            lengths: (R,) steps of each rollout.
+            terminated: (R,) whether the task ended with its last step; None if none did.
+            chunk_size: a chunk ends with the rollout that fills this many samples.
 
         Raises:
-            DataError: sizes that do not fit together.
+            DataError: no rollout, or sizes that do not fit together.
         """
-        # as any array: a memory map stays one
-        observations, actions, rewards = map(np.asanyarray, (observations, actions, rewards))
-        given = np.atleast_1d(lengths)
-        steps = np.where(np.isfinite(given), given, 0).astype(np.intp)
-        ended = np.zeros(len(steps), bool)
-        if terminated is not None:
-            ended = np.atleast_1d(np.asarray(terminated, bool))
-        n = len(rewards)
-        fits = (
-            (observations.ndim, actions.ndim, rewards.ndim) == (2, 2, 1)
-            and steps.ndim == 1
-            and (steps == given).all()
-            and (steps >= 1).all()
-            and steps.sum() == n == len(actions)
-            and len(observations) == n + len(steps)
-            and len(ended) == len(steps)
-        )
-        if not fits:
-            raise DataError(
-                f"observations {observations.shape}, actions {actions.shape}, rewards "
-                f"{rewards.shape} and {len(steps)} lengths that add up to {steps.sum()} do not fit "
-                "together: R roll-outs of n steps in all need (n + R, ds), (n, da), (n,) and (R,)"
-            )
-        if n == 0:
-            return cls(())
-        ends = np.cumsum(steps)
-        # a new chunk begins with the roll-out in which another CHUNK samples are full
-        cuts = np.flatnonzero(np.diff((ends - steps) // CHUNK, prepend=-1))
-        chunks = []
-        for low, high in zip(cuts, [*cuts[1:], len(steps)], strict=True):
-            a, b = int(ends[low] - steps[low]), int(ends[high - 1])
-            chunks.append(
-                ArrayChunk(
-                    observations[a + low : b + high],
-                    actions[a:b],
-                    rewards[a:b],
-                    steps[low:high],
-                    ended[low:high],
-                )
-            )
-        return cls(tuple(chunks))
+        flat = Rollouts.from_arrays(observations, actions, rewards, lengths, terminated, read=False)
+        parts = chunk_slices(flat.offsets, chunk_size)
+        return cls(tuple(ArrayChunk(flat[part]) for part in parts))
 
     def __len__(self) -> int:
         """Number of samples n."""
@@ -185,18 +107,30 @@ class Dataset:
     @cached_property
     def offsets(self) -> IntArray:
         """(chunks + 1,) number of samples before each chunk, and n."""
-        return np.cumsum([0, *(len(chunk) for chunk in self.chunks)])
+        return np.cumsum([0, *(chunk.steps for chunk in self.chunks)])
 
     def split(self, values: FloatArray) -> list[FloatArray]:
         """The parts of ``values`` (n, ...) that belong to each chunk."""
         return np.split(values, self.offsets[1:-1])
 
     def take(self, rows: IntArray) -> Transitions:
-        """The samples of these numbers, which must rise."""
+        """The samples of these numbers, which must ascend."""
         parts = []
-        cuts = np.searchsorted(rows, self.offsets)
+        bounds = np.searchsorted(rows, self.offsets)
         for i, chunk in enumerate(self.chunks):
-            chosen = rows[cuts[i] : cuts[i + 1]] - self.offsets[i]
+            chosen = rows[bounds[i] : bounds[i + 1]] - self.offsets[i]
             if len(chosen):
-                parts.append(chunk.load().rows(chosen))
+                parts.append(chunk.load().transitions.rows(chosen))
         return Transitions.concat(parts)
+
+
+def chunk_slices(offsets: IntArray, chunk_size: int) -> list[slice]:
+    """Which rollouts each chunk holds, from the number of samples before each of them (R + 1,)."""
+    if chunk_size < 1:
+        raise ConfigurationError(f"chunk_size = {chunk_size}, but it must be at least 1")
+    count, first, slices = len(offsets) - 1, 0, []
+    while first < count:
+        last = min(int(np.searchsorted(offsets, offsets[first] + chunk_size)), count)
+        slices.append(slice(first, last))
+        first = last
+    return slices

@@ -2,33 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from kreps.data.rollouts import Rollout
+from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 
 REWARD_RTOL = 2e-7
-"""Differences of rewards below this share of the largest magnitude count as rounding: it is what
+"""Differences of rewards below this fraction of the largest magnitude count as rounding: it is what
 32-bit numbers lose in a sum or a product."""
 
 
-def reward_depends_on_state(rollouts: Sequence[Rollout], task: TaskSpec) -> bool:
-    """Whether the rewards of some rollouts are more than a constant minus an action cost.
+def reward_depends_on_state(data: Rollout | Rollouts, task: TaskSpec) -> bool:
+    """Whether the rewards of at least one step are more than a constant minus an action cost.
 
     Until some rollout reaches a sparse goal, the reward is a constant minus an action cost, and
     learning from it only teaches inaction.  It is detected by a least-squares fit of the rewards by
     a quadratic in the actions: the fit is exact, and no reward is above that of the zero action.
     """
-    rewards = np.concatenate([rollout.rewards for rollout in rollouts])
+    rewards = data.rewards
     tolerance = REWARD_RTOL * np.abs(rewards).max()
     if np.ptp(rewards) <= tolerance:
         return False
-    actions = task.scaled_applied(np.concatenate([rollout.actions for rollout in rollouts]))
-    zero = task.scaled_applied(np.zeros((1, task.action_size)))
-    terms, terms_of_zero = quadratic_terms(actions), quadratic_terms(zero)
+    terms = quadratic_terms(task.scaled_applied(data.actions))
+    terms_of_zero = quadratic_terms(task.scaled_applied(np.zeros((1, task.action_size))))
     if len(terms) <= terms.shape[1]:  # a quadratic fits so few rewards exactly, whatever they are
         return True
     coefficients = np.linalg.lstsq(terms, rewards)[0]
@@ -37,13 +34,13 @@ def reward_depends_on_state(rollouts: Sequence[Rollout], task: TaskSpec) -> bool
 
 
 def is_informative(rollout: Rollout, task: TaskSpec) -> bool:
-    """Whether one rollout is long enough to decide it, and its reward depends on the state."""
-    return is_long_enough(rollout, task) and reward_depends_on_state([rollout], task)
+    """Whether a rollout is long enough to decide it, and its reward depends on the state."""
+    return is_long_enough(rollout, task) and reward_depends_on_state(rollout, task)
 
 
 def is_long_enough(rollout: Rollout, task: TaskSpec) -> bool:
     """Whether a rollout has more steps than a quadratic in the actions has coefficients."""
-    return len(rollout) > quadratic_terms(np.zeros((1, task.action_size))).shape[1]
+    return len(rollout) > (task.action_size + 1) * (task.action_size + 2) // 2
 
 
 def quadratic_terms(actions: FloatArray) -> FloatArray:

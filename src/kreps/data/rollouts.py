@@ -1,9 +1,12 @@
-"""What is learnt from: the task's shape, roll-outs, the window kept of them, its transitions."""
+"""One rollout as users build it, many rollouts in flat arrays, and their transitions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import operator
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, overload
 
 import numpy as np
 
@@ -14,14 +17,17 @@ from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """One roll-out of ``T >= 1`` steps, copied at construction so that no buffer can overwrite it.
+    """One rollout of ``T >= 1`` steps.
+
+    Arrays are checked and copied when it is made, so that a reused buffer cannot change it.
 
     Attributes:
-        observations: (T + 1, ds); row t + 1 is the true successor of row t, the last one
-            included (what came *before* any restart).
+        observations: (T + 1, ds); row t + 1 is the successor of row t.  The last row is the
+            successor of the last step, observed before any restart.
         actions: (T, da) as the policy commanded them, before clipping.
         rewards: (T,).
-        terminated: whether the last step really ended the task (not: was cut off).
+        terminated: whether the task ended with the last step.  False if the rollout was only cut
+            off, by a restart or a time limit.
 
     Raises:
         DataError: wrong shapes, no step at all, NaN or infinities.
@@ -43,17 +49,12 @@ class Rollout:
                     f"{name} have shape {values.shape}, but {dimensions} dimensions are needed: "
                     "observations (T + 1, ds), actions (T, da), rewards (T,)"
                 )
-            if not is_sane(values).all():
-                row = int(np.argwhere(~is_sane(values))[0, 0])
-                raise DataError(
-                    f"{name} hold NaN, an infinity or a number beyond {LARGEST:g}, first in row "
-                    f"{row}; drop the roll-out, or cut it before that step"
-                )
-            values.flags.writeable = False
-            object.__setattr__(self, name, values)
+            if (row := first_invalid_row(values)) is not None:
+                raise DataError(f"{_INVALID.format(name)} row {row}; {_DROP}")
+            object.__setattr__(self, name, _read_only(values))
         steps = len(self.rewards)
         if steps == 0:
-            raise DataError("the roll-out has no step; leave empty roll-outs out")
+            raise DataError("the rollout has no step; leave empty rollouts out")
         if len(self.actions) != steps or len(self.observations) != steps + 1:
             raise DataError(
                 f"{len(self.observations)} observations, {len(self.actions)} actions and {steps} "
@@ -62,32 +63,241 @@ class Rollout:
             )
         object.__setattr__(self, "terminated", bool(self.terminated))
 
+    @classmethod
+    def _view(
+        cls, observations: FloatArray, actions: FloatArray, rewards: FloatArray, terminated: bool
+    ) -> Rollout:
+        """A rollout whose arrays are neither copied nor checked again."""
+        made = object.__new__(cls)
+        values = (observations, actions, rewards, terminated)
+        for field, value in zip(fields(cls), values, strict=True):
+            object.__setattr__(made, field.name, value)
+        return made
+
     def __len__(self) -> int:
+        """Number of steps T."""
         return len(self.rewards)
 
-    def check(self, task: TaskSpec) -> None:
-        """Raise `DataError` unless the widths are those of ``task``."""
-        found = self.observations.shape[1], self.actions.shape[1]
-        wanted = task.observation_size, task.action_size
-        if found != wanted:
+    @property
+    def widths(self) -> tuple[int, int]:
+        """``(ds, da)``."""
+        return self.observations.shape[1], self.actions.shape[1]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Rollouts(Sequence[Rollout]):
+    """R rollouts laid end to end in flat arrays: a sequence whose items are views of them.
+
+    Made by `from_list` or `from_arrays`; the constructor itself checks nothing.
+
+    Attributes:
+        points: (n + R, ds) the observations of all rollouts: n states and the last successor of
+            each rollout.  Those of rollout i are rows ``offsets[i] + i`` to ``offsets[i + 1] + i``.
+        actions: (n, da) as commanded.
+        rewards: (n,).
+        offsets: (R + 1,) number of steps before each rollout, and n.
+        terminated: (R,) whether the task ended with the last step of each rollout.
+    """
+
+    points: FloatArray
+    actions: FloatArray
+    rewards: FloatArray
+    offsets: IntArray
+    terminated: BoolArray
+
+    @classmethod
+    def from_list(cls, rollouts: Iterable[Rollout]) -> Rollouts:
+        """Any number of rollouts, copied once into flat arrays; `Rollouts` are returned unchanged.
+
+        Raises:
+            DataError: an item that is no rollout, or rollouts of different widths.
+        """
+        if isinstance(rollouts, Rollouts):
+            return rollouts
+        if isinstance(rollouts, Rollout):
+            raise DataError("a list of rollouts is needed, but this is one; write [rollout]")
+        items = list(rollouts)
+        for number, item in enumerate(items):
+            if not isinstance(item, Rollout):
+                raise DataError(
+                    f"item {number} is a {type(item).__name__}, not a kreps.Rollout; build one "
+                    "from observations (T + 1, ds), actions (T, da) and rewards (T,)"
+                )
+            if item.widths != items[0].widths:
+                raise DataError(
+                    f"rollout {number} has (observation, action) coordinates {item.widths}, those "
+                    f"before it {items[0].widths}; give rollouts of one task"
+                )
+        if not items:
+            return NO_ROLLOUTS
+        return cls(
+            _read_only(np.concatenate([r.observations for r in items])),
+            _read_only(np.concatenate([r.actions for r in items])),
+            _read_only(np.concatenate([r.rewards for r in items])),
+            np.cumsum([0, *(len(r) for r in items)]),
+            np.array([r.terminated for r in items]),
+        )
+
+    @classmethod
+    def from_arrays(
+        cls,
+        observations: FloatArray,
+        actions: FloatArray,
+        rewards: FloatArray,
+        lengths: Sequence[int] | IntArray | FloatArray,
+        terminated: Sequence[bool] | BoolArray | None = None,
+        *,
+        read: bool = True,
+    ) -> Rollouts:
+        """R rollouts laid end to end in arrays.
+
+        Args:
+            observations: (n + R, ds), those of each rollout followed by its last successor.
+            actions: (n, da) as commanded.
+            rewards: (n,).
+            lengths: (R,) steps of each rollout.
+            terminated: (R,) whether the task ended with its last step; None if none did.
+            read: whether to `read` the values now.  If not, as for memory maps, that must be done
+                before they are used.
+
+        Raises:
+            DataError: sizes that do not fit together, NaN, infinities or absurdly large numbers.
+        """
+        # as any array: a memory map stays one
+        observations, actions, rewards = map(np.asanyarray, (observations, actions, rewards))
+        given = np.atleast_1d(lengths)
+        steps = np.where((given >= 1) & (given <= len(rewards)), given, 0).astype(np.intp)
+        ended = np.zeros(len(steps), bool)
+        if terminated is not None:
+            ended = np.atleast_1d(np.asarray(terminated, bool))
+        fits = (
+            (observations.ndim, actions.ndim, rewards.ndim) == (2, 2, 1)
+            and steps.ndim == 1
+            and ((steps == given) & (steps >= 1)).all()
+            and steps.sum() == len(rewards) == len(actions)
+            and len(observations) == len(rewards) + len(steps)
+            and len(ended) == len(steps)
+        )
+        if not fits:
             raise DataError(
-                f"the roll-out has {found[0]} observation and {found[1]} action coordinates, "
+                f"observations {observations.shape}, actions {actions.shape}, rewards "
+                f"{rewards.shape} and {len(steps)} lengths that add up to {steps.sum()} do not fit "
+                "together: R rollouts of n steps in all need (n + R, ds), (n, da), (n,) and (R,)"
+            )
+        offsets = np.cumsum([0, *steps.tolist()])
+        made = cls(observations, actions, rewards, offsets, ended)
+        return made.read() if read else made
+
+    def read(self) -> Rollouts:
+        """The same rollouts with their values checked and copied into memory, as float64.
+
+        Raises:
+            DataError: NaN, infinities or absurdly large numbers.
+        """
+        arrays = []
+        for name, given in (
+            ("observations", self.points),
+            ("actions", self.actions),
+            ("rewards", self.rewards),
+        ):
+            values = np.array(given, dtype=np.float64)
+            if (row := first_invalid_row(values)) is not None:
+                starts = self.offsets[:-1]
+                if name == "observations":
+                    starts = starts + np.arange(len(self))
+                rollout = int(np.searchsorted(starts, row, side="right")) - 1
+                where = f"row {row - starts[rollout]} of rollout {rollout}"
+                raise DataError(f"{_INVALID.format(name)} {where}; {_DROP}")
+            arrays.append(_read_only(values))
+        points, actions, rewards = arrays
+        return Rollouts(points, actions, rewards, self.offsets, self.terminated)
+
+    def load(self) -> Rollouts:
+        """Itself: it is in memory already (see `kreps.data.dataset.Chunk`)."""
+        return self
+
+    def check(self, task: TaskSpec) -> None:
+        """Raise `DataError` unless there is no rollout or the widths are those of ``task``."""
+        found = self.points.shape[1], self.actions.shape[1]
+        wanted = task.observation_size, task.action_size
+        if len(self) and found != wanted:
+            raise DataError(
+                f"the rollouts have {found[0]} observation and {found[1]} action coordinates, "
                 f"the task {wanted[0]} and {wanted[1]}"
             )
+
+    def __len__(self) -> int:
+        """Number of rollouts R."""
+        return len(self.terminated)
+
+    @overload
+    def __getitem__(self, index: int) -> Rollout: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> Rollouts: ...
+
+    def __getitem__(self, index: int | slice) -> Rollout | Rollouts:
+        """One rollout, or several as a container; both are views unless a slice has a step."""
+        if isinstance(index, slice):
+            return self._slice(index)
+        i = range(len(self))[operator.index(index)]
+        low, high = self.offsets[i], self.offsets[i + 1]
+        return Rollout._view(
+            self.points[low + i : high + i + 1],
+            self.actions[low:high],
+            self.rewards[low:high],
+            bool(self.terminated[i]),
+        )
+
+    def _slice(self, index: slice) -> Rollouts:
+        first, last, step = index.indices(len(self))
+        if step != 1:
+            return Rollouts.from_list([self[i] for i in range(first, last, step)])
+        last = max(first, last)
+        low, high = self.offsets[first], self.offsets[last]
+        return Rollouts(
+            self.points[low + first : high + last],
+            self.actions[low:high],
+            self.rewards[low:high],
+            self.offsets[first : last + 1] - low,
+            self.terminated[first:last],
+        )
+
+    def __repr__(self) -> str:
+        return f"<Rollouts: {len(self)} of {self.steps} steps in all>"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The arrays alone: what is derived from them need not be sent to another process."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @property
+    def steps(self) -> int:
+        """Number of steps n of all rollouts."""
+        return int(self.offsets[-1])
+
+    @property
+    def lengths(self) -> IntArray:
+        """(R,) number of steps of each rollout."""
+        return np.diff(self.offsets)
+
+    @cached_property
+    def transitions(self) -> Transitions:
+        """The n transitions; points, actions and rewards are the same arrays."""
+        return Transitions.from_rollouts(self)
 
 
 @dataclass(frozen=True, eq=False)
 class Transitions:
-    """The n steps of some roll-outs as flat arrays; states are named by row of ``points``.
+    """n steps of R rollouts as flat arrays; a state is given by its row of ``points``.
 
     Attributes:
-        points: (n + R, ds) all states of R roll-outs in order: the set S~ of Eq. 3.
+        points: (k, ds) states; of whole rollouts all n + R in order: the set S~ of Eq. 3.
         state, successor: (n,) rows of s_i and of s'_i.
         start: (R,) rows of the start states.
-        rollout: (n,) which of the R roll-outs each step is of.
+        rollout: (n,) number of the rollout that each step belongs to.
         actions: (n, da) commanded.
         rewards: (n,).
-        terminated: (n,) whether step i really ended the task.
+        terminated: (n,) whether the task ended with step i.
     """
 
     points: FloatArray
@@ -100,73 +310,81 @@ class Transitions:
     terminated: BoolArray
 
     def __len__(self) -> int:
+        """Number of steps n."""
         return len(self.rewards)
 
     @property
     def states(self) -> FloatArray:
+        """(n, ds) the states s_i."""
         return self.points[self.state]
 
     @classmethod
-    def from_rollouts(cls, rollouts: Sequence[Rollout]) -> Transitions:
-        """Flatten at least one roll-out."""
-        return cls.from_arrays(
-            np.concatenate([r.observations for r in rollouts]),
-            np.concatenate([r.actions for r in rollouts]),
-            np.concatenate([r.rewards for r in rollouts]),
-            np.array([len(r) for r in rollouts]),
-            np.array([r.terminated for r in rollouts]),
-        )
-
-    @classmethod
-    def from_arrays(
-        cls,
-        points: FloatArray,
-        actions: FloatArray,
-        rewards: FloatArray,
-        lengths: IntArray,
-        ended: BoolArray,
-    ) -> Transitions:
-        """R roll-outs laid end to end in arrays: (n + R, ds), (n, da), (n,), (R,) and (R,)."""
-        ends = np.cumsum(lengths)
-        rollout = np.repeat(np.arange(len(lengths)), lengths)
-        state = np.arange(len(rewards)) + rollout
-        terminated = np.zeros(len(rewards), dtype=bool)
-        terminated[ends - 1] = ended
-        start = ends - lengths + np.arange(len(lengths))
+    def from_rollouts(cls, rollouts: Iterable[Rollout]) -> Transitions:
+        """All steps of some rollouts, in order."""
+        flat = Rollouts.from_list(rollouts)
+        numbers = np.arange(len(flat))
+        rollout = np.repeat(numbers, flat.lengths)
+        state = np.arange(flat.steps) + rollout
+        terminated = np.zeros(flat.steps, dtype=bool)
+        terminated[flat.offsets[1:] - 1] = flat.terminated
+        start = flat.offsets[:-1] + numbers
+        points, actions, rewards = flat.points, flat.actions, flat.rewards
         return cls(points, state, state + 1, start, rollout, actions, rewards, terminated)
 
     @classmethod
     def concat(cls, parts: Sequence[Transitions]) -> Transitions:
-        """All steps of at least one set of them, in order."""
+        """The steps of all parts, of which there must be one at least, in order."""
         if len(parts) == 1:
             return parts[0]
-        before = np.cumsum([0, *(len(part.points) for part in parts[:-1])])
-        earlier = np.cumsum([0, *(len(part.start) for part in parts[:-1])])
+        points_before = np.cumsum([0, *(len(part.points) for part in parts[:-1])])
+        rollouts_before = np.cumsum([0, *(len(part.start) for part in parts[:-1])])
+        shifted = list(zip(parts, points_before, rollouts_before, strict=True))
         return cls(
             points=np.concatenate([part.points for part in parts]),
-            state=np.concatenate([p.state + b for p, b in zip(parts, before, strict=True)]),
-            successor=np.concatenate([p.successor + b for p, b in zip(parts, before, strict=True)]),
-            start=np.concatenate([p.start + b for p, b in zip(parts, before, strict=True)]),
-            rollout=np.concatenate([p.rollout + e for p, e in zip(parts, earlier, strict=True)]),
+            state=np.concatenate([part.state + points for part, points, _ in shifted]),
+            successor=np.concatenate([part.successor + points for part, points, _ in shifted]),
+            start=np.concatenate([part.start + points for part, points, _ in shifted]),
+            rollout=np.concatenate([part.rollout + rollouts for part, _, rollouts in shifted]),
             actions=np.concatenate([part.actions for part in parts]),
             rewards=np.concatenate([part.rewards for part in parts]),
             terminated=np.concatenate([part.terminated for part in parts]),
         )
 
     def rows(self, chosen: IntArray) -> Transitions:
-        """Some of the steps, with the start states of the roll-outs that they are of."""
+        """The steps with these numbers, and the start states of their rollouts."""
         if len(chosen) == len(self):
             return self
         k = len(chosen)
-        of, rollout = np.unique(self.rollout[chosen], return_inverse=True)
-        named = (self.state[chosen], self.successor[chosen], self.start[of])
+        present, rollout = np.unique(self.rollout[chosen], return_inverse=True)
+        needed = (self.state[chosen], self.successor[chosen], self.start[present])
         return Transitions(
-            points=self.points[np.concatenate(named)],
+            points=self.points[np.concatenate(needed)],
             state=np.arange(k),
             successor=k + np.arange(k),
-            start=2 * k + np.arange(len(of)),
+            start=2 * k + np.arange(len(present)),
             rollout=rollout,
             actions=self.actions[chosen],
             rewards=self.rewards[chosen],
             terminated=self.terminated[chosen],
         )
+
+
+_INVALID = f"{{}} hold NaN, an infinity or a number beyond {LARGEST:g}, first in"
+_DROP = "drop the rollout, or cut it before that step"
+
+
+def first_invalid_row(values: FloatArray) -> int | None:
+    """Number of the first row with a value that is NaN, infinite or absurdly large, if any is."""
+    valid = is_sane(values)
+    return None if valid.all() else int(np.argwhere(~valid)[0, 0])
+
+
+def _read_only(values: FloatArray) -> FloatArray:
+    values.flags.writeable = False
+    return values
+
+
+NO_ROLLOUTS = Rollouts(
+    np.empty((0, 0)), np.empty((0, 0)), np.empty(0), np.zeros(1, np.intp), np.empty(0, bool)
+)
+"""The empty container, of no widths."""

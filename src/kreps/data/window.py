@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
 from kreps.data.rewards import is_informative, is_long_enough, reward_depends_on_state
-from kreps.data.rollouts import Rollout, Transitions
+from kreps.data.rollouts import NO_ROLLOUTS, Rollout, Rollouts, Transitions
 from kreps.data.task import TaskSpec
 
-RESERVED = 3
-"""One place in so many is reserved for rollouts with a state-dependent reward.  Where a goal is
-seldom reached, the latest rollouts may not contain it, and learning from them alone only teaches
-to avoid the cost of actions."""
+RESERVED_SHARE = 3
+"""One in so many of the window's rollouts is reserved for those with a state-dependent reward.
+Where a goal is seldom reached, the newest rollouts may not contain it, and learning from them alone
+would only lower the cost of actions."""
 
 
 @dataclass(frozen=True, eq=False)
 class ReplayWindow:
-    """The latest rollouts, with a third of the places reserved for informative ones.
+    """The newest rollouts, a third of which are the newest informative ones.
 
-    Where every rollout is informative, as in most tasks, these are simply the latest.
+    Where every rollout is informative, as in most tasks, these are simply the newest.
 
     Attributes:
         task: that the rollouts are of.
@@ -31,55 +31,58 @@ class ReplayWindow:
 
     task: TaskSpec
     capacity: int | None
-    rollouts: tuple[Rollout, ...] = ()
+    rollouts: Rollouts = NO_ROLLOUTS
     informative: tuple[bool, ...] = ()
 
-    def append(self, rollouts: Sequence[Rollout]) -> ReplayWindow:
+    def append(self, rollouts: Iterable[Rollout]) -> ReplayWindow:
         """The window after some new rollouts.
 
         Raises:
             DataError: observations or actions of another width than the task's.
         """
-        for rollout in rollouts:
-            rollout.check(self.task)
-        seen = (*self.rollouts, *rollouts)
-        informative = (
-            *self.informative,
-            *(is_informative(rollout, self.task) for rollout in rollouts),
-        )
-        kept = list(range(len(seen)))
-        if self.capacity is not None and len(seen) > self.capacity:
-            places = [i for i in kept if informative[i]]
-            reserved = places[len(places) - min(self._reserved, len(places)) :]
-            others = sorted(set(kept) - set(reserved))
-            kept = sorted(reserved + others[len(reserved) - self.capacity :])
+        new = Rollouts.from_list(rollouts)
+        new.check(self.task)
+        seen = [*self.rollouts, *new]
+        informative = [*self.informative, *(is_informative(rollout, self.task) for rollout in new)]
+        kept = self._kept(informative)
         return ReplayWindow(
             self.task,
             self.capacity,
-            tuple(seen[i] for i in kept),
+            Rollouts.from_list([seen[i] for i in kept]),
             tuple(informative[i] for i in kept),
         )
 
-    @property
-    def _reserved(self) -> int:
-        return 0 if self.capacity is None else self.capacity // RESERVED
+    def _kept(self, informative: list[bool]) -> list[int]:
+        """Numbers of the rollouts to keep, oldest first, given which of them are informative."""
+        numbers = list(range(len(informative)))
+        if self.capacity is None or len(numbers) <= self.capacity:
+            return numbers
+        candidates = [i for i in numbers if informative[i]]
+        reserved = candidates[len(candidates) - min(self._reserved, len(candidates)) :]
+        others = sorted(set(numbers) - set(reserved))
+        return sorted(reserved + others[len(reserved) - self.capacity :])
 
     @property
-    def newest(self) -> tuple[Rollout, ...]:
-        """The rollouts in the places that are not reserved."""
+    def _reserved(self) -> int:
+        """Number of rollouts reserved for informative ones."""
+        return 0 if self.capacity is None else self.capacity // RESERVED_SHARE
+
+    @property
+    def newest(self) -> Rollouts:
+        """The newest rollouts, as many as are not reserved."""
         if self.capacity is None:
             return self.rollouts
         return self.rollouts[self._reserved - self.capacity :]
 
     @cached_property
     def reward_depends_on_state(self) -> bool:
-        """Whether any reward of the window depends on more than the action."""
+        """Whether the rewards of the window depend on more than the action."""
         return reward_depends_on_state(self.rollouts, self.task)
 
     @cached_property
     def newest_depend_on_state(self) -> bool:
         """The same for the newest rollouts; False if there are none."""
-        return bool(self.newest) and reward_depends_on_state(self.newest, self.task)
+        return len(self.newest) > 0 and reward_depends_on_state(self.newest, self.task)
 
     @property
     def all_informative(self) -> bool:
@@ -91,8 +94,10 @@ class ReplayWindow:
 
     @property
     def steps(self) -> int:
-        return sum(map(len, self.rollouts))
+        """Number of steps of all rollouts."""
+        return self.rollouts.steps
 
-    @cached_property
+    @property
     def transitions(self) -> Transitions:
-        return Transitions.from_rollouts(self.rollouts)
+        """The steps of all rollouts, in order."""
+        return self.rollouts.transitions

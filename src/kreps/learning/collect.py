@@ -12,7 +12,7 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 
-from kreps.data.rollouts import Rollout
+from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import LARGEST, TaskSpec, is_sane
 from kreps.envs.batch import BatchModel, SettableModel
 from kreps.envs.restart import restart_length, stratified_lengths
@@ -41,7 +41,7 @@ def collect(
     stratified: bool = False,
     exponent: float = WHITE,
     on_rollout: Callable[[int], None] | None = None,
-) -> list[Rollout]:
+) -> Rollouts:
     """``count`` roll-outs of random length.
 
     Args:
@@ -80,7 +80,7 @@ def collect_grid(
     most: int,
     seed: int,
     iteration: int,
-) -> list[Rollout]:
+) -> Rollouts:
     """One step from every point of a grid over states and actions: roll-outs of one step.
 
     Args:
@@ -128,12 +128,8 @@ def collect_grid(
         raise
     except Exception as error:
         raise _failure(error, "a grid of states", 0) from error
-    return [
-        Rollout(np.stack([before, after]), action[None], np.array([reward]), bool(end))
-        for before, after, action, reward, end in zip(
-            observations, successors, actions, rewards, ended, strict=True
-        )
-    ]
+    points = np.stack([observations, successors], axis=1).reshape(2 * count, -1)
+    return Rollouts.from_arrays(points, actions, rewards, np.ones(count), ended)
 
 
 def simulate(
@@ -143,7 +139,7 @@ def simulate(
     seeds: Sequence[int],
     noises: Sequence[FloatArray],
     on_rollout: Callable[[int], None] | None = None,
-) -> list[Rollout]:
+) -> Rollouts:
     """One roll-out per seed, with the policy's noise as given, (length, da) each, and as long."""
     model = batch_model_of(env)
     if model is not None:
@@ -151,12 +147,12 @@ def simulate(
         if on_rollout is not None:
             on_rollout(len(rollouts))
         return rollouts
-    rollouts = []
+    collected = []
     for number, (seed, noise) in enumerate(zip(seeds, noises, strict=True)):
-        rollouts.append(_simulate_one(env, task, policy, seed, noise, number))
+        collected.append(_simulate_one(env, task, policy, seed, noise, number))
         if on_rollout is not None:
             on_rollout(number + 1)
-    return rollouts
+    return Rollouts.from_list(collected)
 
 
 def _simulate_batch(
@@ -165,7 +161,7 @@ def _simulate_batch(
     policy: StochasticPolicy,
     seeds: Sequence[int],
     noises: Sequence[FloatArray],
-) -> list[Rollout]:
+) -> Rollouts:
     rngs = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
     ends = np.array([len(noise) for noise in noises])  # shortened where a roll-out really ends
     terminated = np.zeros(len(ends), dtype=bool)
@@ -193,10 +189,15 @@ def _simulate_batch(
         raise
     except Exception as error:
         raise _failure(error, "its batch of roll-outs", t) from error
-    return [
-        Rollout(observations[: end + 1, j], actions[:end, j], rewards[:end, j], bool(terminated[j]))
-        for j, end in enumerate(ends.tolist())
-    ]
+    numbers = np.arange(longest + 1)
+    taken, observed = numbers[:-1] < ends[:, None], numbers <= ends[:, None]
+    return Rollouts.from_arrays(
+        observations.swapaxes(0, 1)[observed],
+        actions.swapaxes(0, 1)[taken],
+        rewards.T[taken],
+        ends,
+        terminated,
+    )
 
 
 def _simulate_one(

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kreps.data.rollouts import Rollout
+from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.collect import simulate
@@ -52,7 +52,7 @@ def evaluation_rollouts(
     episodes: int,
     steps: int,
     seed: int,
-) -> list[Rollout]:
+) -> Rollouts:
     """Roll-outs without restarts; the same seed gives every policy the same random numbers."""
     inside, _ = without_restarts(env)
     return simulate(

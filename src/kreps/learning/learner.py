@@ -19,7 +19,7 @@ from kreps.algorithms.state import LearnerState, UpdateReport
 from kreps.algorithms.update import update as reps_update
 from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
-from kreps.data.rollouts import Rollout
+from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError
@@ -222,7 +222,7 @@ class Learner(Generic[MethodSettings]):
                 iteration=self.state.iteration,
                 rollouts=self.state.rollouts,
                 steps=self.state.steps,
-                average_reward=float(np.concatenate([r.rewards for r in rollouts]).mean()),
+                average_reward=float(rollouts.rewards.mean()),
                 update=info,
                 rollout_seconds=seconds,
             )
@@ -239,23 +239,15 @@ class Learner(Generic[MethodSettings]):
         Raises:
             DataError: not roll-outs, none of them, or of other widths than the task's.
         """
-        if isinstance(rollouts, Rollout):
-            raise DataError("update() takes a list of roll-outs; write update([rollout])")
         if isinstance(rollouts, Dataset):
             raise DataError(
                 f"{type(self).__name__} learns from all samples at once and takes a list of "
                 "roll-outs; only KREPS learns from a data set"
             )
-        rollouts = list(rollouts)
-        for number, rollout in enumerate(rollouts):
-            if not isinstance(rollout, Rollout):
-                raise DataError(
-                    f"item {number} is a {type(rollout).__name__}, not a kreps.Rollout; build one "
-                    "from observations (T + 1, ds), actions (T, da) and rewards (T,)"
-                )
-        if not rollouts:
-            raise DataError("there is no new roll-out to learn from; give at least one")
-        return self._update(rollouts)
+        new = Rollouts.from_list(rollouts)
+        if not new:
+            raise DataError("there is no new rollout to learn from; give at least one")
+        return self._update(new)
 
     def _update(self, samples: Any) -> UpdateReport:
         rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
@@ -266,7 +258,7 @@ class Learner(Generic[MethodSettings]):
     def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:
         return type(self).algorithm(self.state, samples, self.task, self.settings, rng)
 
-    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
+    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
         """The next iteration's data."""
         raise NotImplementedError
 
@@ -319,7 +311,7 @@ class Learner(Generic[MethodSettings]):
 class OnPolicyLearner(Learner[OnPolicy]):
     """A learner that explores by its own stochastic policy, from start states only (Sec. 4.1)."""
 
-    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
+    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
         policy, exponent = self._acting()
         return collect(
             env,
@@ -342,7 +334,7 @@ class OnPolicyLearner(Learner[OnPolicy]):
     @property
     def exploring(self) -> bool:
         window = self.state.window
-        return bool(window.rollouts) and not window.newest_depend_on_state
+        return len(window.rollouts) > 0 and not window.newest_depend_on_state
 
     def _acting(self) -> tuple[StochasticPolicy, float]:
         """The policy of the next roll-outs, and the exponent of its noise's spectrum."""
@@ -455,7 +447,7 @@ class GridValueIteration(Learner[GridValueIterationSettings]):
     settings_type = GridValueIterationSettings
     algorithm = staticmethod(value_iteration.update)
 
-    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> list[Rollout]:
+    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
         settings = self.settings
         rollouts = collect_grid(
             env,

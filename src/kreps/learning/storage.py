@@ -21,11 +21,11 @@ import safetensors.numpy
 
 from kreps.algorithms.state import LearnerState
 from kreps.data.dataset import Dataset
-from kreps.data.rollouts import Rollout, Transitions
+from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec, is_sane
 from kreps.data.window import ReplayWindow
-from kreps.errors import KrepsError, StorageError
-from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.errors import DataError, KrepsError, StorageError
+from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import FourierExpansion, KernelExpansion, LinearFunction
 from kreps.kernels.kernel import Kernel, WrapAngle, wrap_factors
 from kreps.kernels.threads import blas_threads
@@ -487,18 +487,17 @@ def _value_of(tensors: Tensors, task: TaskSpec) -> LinearFunction:
     return value
 
 
-def _rollout_parts(rollouts: Sequence[Rollout]) -> Tensors:
+def _rollout_parts(rollouts: Rollouts) -> Tensors:
     return {
-        "window.lengths": np.array([len(r) for r in rollouts], dtype=np.float64),
-        "window.terminated": np.array([r.terminated for r in rollouts], dtype=np.float64),
-        "window.observations": np.concatenate([r.observations for r in rollouts]),
-        "window.actions": np.concatenate([r.actions for r in rollouts]),
-        "window.rewards": np.concatenate([r.rewards for r in rollouts]),
+        "window.lengths": rollouts.lengths.astype(np.float64),
+        "window.terminated": rollouts.terminated.astype(np.float64),
+        "window.observations": rollouts.points,
+        "window.actions": rollouts.actions,
+        "window.rewards": rollouts.rewards,
     }
 
 
-def _laid_out(tensors: Tensors, ds: str | int, da: str | int) -> tuple[Tensors, IntArray]:
-    """Roll-outs end to end, and their lengths, once they are known to fit together."""
+def _rollouts_of(tensors: Tensors, ds: str | int, da: str | int) -> Rollouts:
     t = _take(
         tensors,
         {
@@ -509,23 +508,13 @@ def _laid_out(tensors: Tensors, ds: str | int, da: str | int) -> tuple[Tensors, 
             "window.rewards": ("n",),
         },
     )
-    lengths, n = t["window.lengths"], len(t["window.rewards"])
-    whole = (lengths >= 1).all() and (lengths <= n).all() and (lengths % 1 == 0).all()
-    if not whole or lengths.sum() != n or len(t["window.observations"]) != n + len(lengths):
-        raise StorageError("the lengths of its roll-outs do not fit their data")
-    return t, lengths.astype(np.intp)
-
-
-def _rollouts_of(tensors: Tensors, ds: str | int, da: str | int) -> list[Rollout]:
-    t, lengths = _laid_out(tensors, ds, da)
-    cuts = np.cumsum(lengths)[:-1]
-    observations = np.split(t["window.observations"], cuts + np.arange(1, len(lengths)))
-    actions = np.split(t["window.actions"], cuts)
-    rewards = np.split(t["window.rewards"], cuts)
-    return [
-        Rollout(o, a, r, bool(end))
-        for o, a, r, end in zip(observations, actions, rewards, t["window.terminated"], strict=True)
-    ]
+    return Rollouts.from_arrays(
+        t["window.observations"],
+        t["window.actions"],
+        t["window.rewards"],
+        t["window.lengths"],
+        t["window.terminated"] != 0,
+    )
 
 
 # ---- roll-outs --------------------------------------------------------------------------------
@@ -538,14 +527,14 @@ def save_rollouts(rollouts: Iterable[Rollout], path: str | Path) -> None:
         DataError: no roll-out, something else, or different widths.
         StorageError: the file cannot be written.
     """
-    rollouts = list(rollouts) if not isinstance(rollouts, Rollout) else [rollouts]
-    Dataset.from_rollouts(rollouts)  # complains
-    samples = sum(len(r) for r in rollouts)
-    write_arrays(Path(path), "rollouts", _rollout_parts(rollouts), {"samples": samples})
+    flat = Rollouts.from_list([rollouts] if isinstance(rollouts, Rollout) else rollouts)
+    if not flat:
+        raise DataError("there is no rollout to save; give at least one")
+    write_arrays(Path(path), "rollouts", _rollout_parts(flat), {"samples": flat.steps})
 
 
-def load_rollouts(path: str | Path) -> list[Rollout]:
-    """Roll-outs written by `save_rollouts`.
+def load_rollouts(path: str | Path) -> Rollouts:
+    """Rollouts written by `save_rollouts`.
 
     Raises:
         StorageError: the file is missing, damaged or foreign.
@@ -554,38 +543,24 @@ def load_rollouts(path: str | Path) -> list[Rollout]:
     try:
         return _rollouts_of(tensors, "ds", "da")
     except KrepsError as error:
-        raise _inconsistent(path, "file of roll-outs", error) from error
+        raise _inconsistent(path, "file of rollouts", error) from error
 
 
 @dataclass(frozen=True)
 class RolloutFile:
-    """A file of roll-outs as a chunk of a data set: read when it is needed, by whoever needs it."""
+    """A file of rollouts as a chunk of a data set, which is read whenever it is needed."""
 
     path: Path
-    samples: int
+    steps: int
 
-    def __len__(self) -> int:
-        return self.samples
-
-    def load(self) -> Transitions:
-        tensors, _ = read_arrays(self.path, "rollouts")
-        try:
-            t, lengths = _laid_out(tensors, "ds", "da")
-        except KrepsError as error:
-            raise _inconsistent(self.path, "file of roll-outs", error) from error
-        found = len(t["window.rewards"])
-        if found != self.samples:
+    def load(self) -> Rollouts:
+        rollouts = load_rollouts(self.path)
+        if rollouts.steps != self.steps:
             raise StorageError(
-                f"{self.path} holds {found} samples, but had {self.samples} when the folder "
+                f"{self.path} holds {rollouts.steps} samples, but had {self.steps} when the folder "
                 "was opened; open it again"
             )
-        return Transitions.from_arrays(
-            t["window.observations"],
-            t["window.actions"],
-            t["window.rewards"],
-            lengths,
-            t["window.terminated"] != 0,
-        )
+        return rollouts
 
 
 def rollout_folder(path: str | Path) -> Dataset:
@@ -650,7 +625,7 @@ def save_checkpoint(
         "rollouts": state.rollouts,
         "steps": state.steps,
     }
-    if state.window.rollouts:
+    if len(state.window.rollouts):
         tensors |= _rollout_parts(state.window.rollouts)
     if state.policy is not None:
         parts, header["policy"] = _policy_parts(state.policy)
