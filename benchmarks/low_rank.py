@@ -29,7 +29,7 @@ from matplotlib.figure import Figure
 import kreps
 from kreps.data.compute import CHUNK_SIZE
 from kreps.data.task import TaskSpec
-from kreps.experiments.runner import commit
+from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
 from kreps.kernels.basis import FourierBasis, RKHSBasis
 from kreps.kernels.kernel import Kernel, factors_of

@@ -59,7 +59,7 @@ from numpy.typing import NDArray
 from kreps.data.task import TaskSpec
 from kreps.envs import RandomRestart
 from kreps.experiments.executors import executor
-from kreps.experiments.runner import commit
+from kreps.experiments.provenance import commit
 from kreps.experiments.specs import TASKS as OURS
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.threads import blas_threads

@@ -23,7 +23,7 @@ import numpy as np
 from peers import MARKS, TASKS, Stopwatch, Trial, add_tasks, model_of, positive, seeds_of, write
 
 import kreps
-from kreps.experiments.runner import commit
+from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
 from kreps.kernels.threads import blas_threads
 from kreps.versions import versions

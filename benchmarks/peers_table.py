@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from kreps.experiments.figures import at_most, read_off
+from kreps.experiments.figures import at_most, value_at
 from kreps.experiments.specs import FEATURES
 from kreps.experiments.tables import markdown
 
@@ -59,7 +59,7 @@ def of_peers(task: str, learner: str) -> list[Curve]:
 
 def line(task: str, name: str, curves: list[Curve], seconds: Sequence[float]) -> Any:
     read = [
-        f"{read_off(curves, 'stochastic', mark)} / {read_off(curves, 'greedy', mark)}"
+        f"{value_at(curves, 'stochastic', mark)} / {value_at(curves, 'greedy', mark)}"
         for mark in MARKS
     ]
     return [task, name, str(len(curves)), *read, f"{np.mean(seconds):.0f}"]

@@ -32,7 +32,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import kreps
-from kreps.experiments.runner import commit
+from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.threads import blas_threads

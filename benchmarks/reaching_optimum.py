@@ -22,7 +22,7 @@ from scipy.optimize import minimize
 
 from kreps import KREPS
 from kreps.envs.reaching import MAX_TORQUE, ReachingBatch
-from kreps.experiments.runner import commit
+from kreps.experiments.provenance import commit
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.evaluate import Greedy, evaluation_rollouts
 from kreps.versions import versions

@@ -14,7 +14,7 @@ from measuring import Measured
 from peak import Peak
 from threadpoolctl import threadpool_info
 
-from kreps.experiments.runner import commit
+from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
 from kreps.versions import versions
 

@@ -20,7 +20,7 @@ from scipy import sparse
 
 import kreps
 from kreps.envs import swing_up
-from kreps.experiments.runner import commit
+from kreps.experiments.provenance import commit
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.environment import task_of
 from kreps.learning.evaluate import evaluate

@@ -258,7 +258,7 @@ def test_a_known_local_optimum_is_named_by_the_evaluation() -> None:
     stuck = evaluation(-62.5, -62.0)
     found = finding("local optimum", stuck, REFERENCES, average_reward=LEVEL)
     assert found.severity == "limit" and found.limit == -61.9 and found.value == -62.0
-    assert "the lean" in found.sentence and "--seed" in found.remedy
+    assert "local optimum (constant torque)" in found.sentence and "--seed" in found.remedy
 
 
 def test_a_known_local_optimum_is_named_by_the_roll_outs_too() -> None:
@@ -281,7 +281,7 @@ def test_no_local_optimum_is_made_up(
 ) -> None:
     found = diagnose(rows(**changes), evaluation(reward, reward), references)
     near = [f.sentence for f in found if f.name == "local optimum"]
-    assert all("the lean" not in sentence for sentence in near)
+    assert all("constant torque" not in sentence for sentence in near)
 
 
 def test_near_the_best_known_reward_nothing_is_stuck() -> None:

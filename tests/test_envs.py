@@ -295,8 +295,8 @@ def test_the_wrapped_angle_stays_inside_the_observation_space() -> None:
     assert swing_up.wrap_angle(np.array([0.0]))[0] == 0.0
 
 
-def test_reference_value_of_the_lean_which_exists_on_one_side_only() -> None:
-    reference = REFERENCE_REWARDS[NAME]["the lean (constant torque)"]
+def test_reference_value_of_constant_torque_is_a_local_optimum_on_one_side_only() -> None:
+    reference = REFERENCE_REWARDS[NAME]["local optimum (constant torque)"]
     assert average_reward(Constant(-30.0)) == pytest.approx(reference, abs=0.7)
     # the reward is 10 theta^2 with theta cut at 3 pi / 2: leaning to larger angles costs more
     assert average_reward(Constant(30.0)) < 2.0 * reference

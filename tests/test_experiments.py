@@ -1,4 +1,4 @@
-"""Experiments: cells that run once, survive interruption, and are summed up without loss."""
+"""Experiments: each trial runs once, results survive interruptions, summaries are complete."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.errors import CellFailure, ConfigurationError, StorageError
+from kreps.errors import ConfigurationError, StorageError, TrialFailure
 from kreps.experiments import claims, search
-from kreps.experiments.claims import CLAIMS, Claim, Kind, judge, verdict, write_claims
+from kreps.experiments.claims import CLAIMS, Claim, Kind, assess, verdict, write_claims
 from kreps.experiments.executors import executor
 from kreps.experiments.figures import (
     draw_features,
@@ -33,23 +33,24 @@ from kreps.experiments.trials import (
     Trial,
     commits_of,
     name_of,
-    read_cell,
-    run_cell,
+    read_trial,
+    run_trial,
     trial_of,
-    write_cell,
+    write_trial,
 )
 from kreps.learning.learner import LEARNERS
+from kreps.presets import flat
 
 TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 
 
 def tiny(seed: int, method: str = "kernel REPS", **options: Any) -> Trial:
-    """A cell that takes a moment."""
+    """A trial that takes a fraction of a second."""
     return trial_of("swing-up", method, seed, {**TINY, **options}, iterations=2, episodes=(3, 5))
 
 
 class Inline(Executor):
-    """Runs at once in this process, counts, and may fail at some call."""
+    """Runs at once in this process, counts the calls, and fails at one of them if asked to."""
 
     def __init__(self, fail_at: int | None = None) -> None:
         self.calls = 0
@@ -65,18 +66,18 @@ class Inline(Executor):
         return future
 
 
-def test_cells_are_each_curve_with_each_seed_from_zero() -> None:
-    cells = figure_trials("swing-up", 3, None)
+def test_a_figure_has_a_trial_per_curve_and_seed_from_zero() -> None:
+    trials = figure_trials("swing-up", 3, None)
     methods = [method for _, method in FIGURES["swing-up"]]
     assert {"kreps (default)", "paper-like"} <= set(methods)
-    assert [(c.method, c.seed) for c in cells] == [
+    assert [(c.method, c.seed) for c in trials] == [
         (method, seed) for seed in range(3) for method in methods
     ]
-    assert {c.iterations for c in cells} == {20}
-    assert len({c.name for c in cells}) == len(cells)
+    assert {c.iterations for c in trials} == {20}
+    assert len({c.name for c in trials}) == len(trials)
 
 
-def test_the_figures_show_what_the_paper_shows() -> None:
+def test_the_figures_have_the_curves_of_the_paper() -> None:
     of = {name: {method for _, method in curves} for name, curves in FIGURES.items()}
     assert not {"REPS, RBF grid"} & of["figure-1a"]  # no grid over a six-dimensional space
     assert "NPALP" in of["figure-1a"]
@@ -89,51 +90,51 @@ def test_the_figures_show_what_the_paper_shows() -> None:
 @pytest.mark.parametrize("task", TASKS)
 @pytest.mark.parametrize("method", METHODS)
 def test_every_method_takes_its_options(task: str, method: str) -> None:
-    cell = trial_of(task, method, 0, {}, iterations=None, episodes=(2, 2))
-    LEARNERS[cell.learner](gym.make(cell.environment), seed=0, **cell.options)
+    trial = trial_of(task, method, 0, {}, iterations=None, episodes=(2, 2))
+    LEARNERS[trial.learner](gym.make(trial.environment), seed=0, **trial.options)
 
 
-def test_a_cell_evaluates_every_iteration_and_repeats_exactly() -> None:
-    cell = tiny(0)
-    result = run_cell(cell)
+def test_a_trial_evaluates_every_iteration_and_repeats_exactly() -> None:
+    trial = tiny(0)
+    result = run_trial(trial)
     assert [row["iteration"] for row in result["rows"]] == [1, 2]
     steps = [row["steps"] for row in result["rows"]]
     assert steps[0] < steps[1]
-    again = run_cell(cell)
+    again = run_trial(trial)
     for row, same in zip(result["rows"], again["rows"], strict=True):
         assert (row["stochastic"], row["greedy"]) == (same["stochastic"], same["greedy"])
 
 
-def test_what_is_done_is_never_run_again(tmp_path: Path) -> None:
-    cells = [tiny(seed, method) for seed in (0, 1) for method in ("kernel REPS", "NPALP")]
+def test_trials_with_a_result_are_not_run_again(tmp_path: Path) -> None:
+    trials = [tiny(seed, method) for seed in (0, 1) for method in ("kernel REPS", "NPALP")]
     broken = Inline(fail_at=2)
-    with pytest.raises(CellFailure, match=r"1 of 4 cells failed, .*power"):
-        run_trials(cells, broken, tmp_path)
-    done = [cell for cell in cells if read_cell(cell, tmp_path)]
-    assert len(done) == len(cells) - 1
+    with pytest.raises(TrialFailure, match=r"1 of 4 trials failed, .*power"):
+        run_trials(trials, broken, tmp_path)
+    done = [trial for trial in trials if read_trial(trial, tmp_path)]
+    assert len(done) == len(trials) - 1
     rest = Inline()
-    results = run_trials([*cells, cells[0]], rest, tmp_path)
+    results = run_trials([*trials, trials[0]], rest, tmp_path)
     assert rest.calls == 1
-    assert [name_of(r) for r in results] == [c.name for c in cells]
+    assert [name_of(r) for r in results] == [c.name for c in trials]
     idle = Inline()
-    assert run_trials(cells, idle, tmp_path) == results
+    assert run_trials(trials, idle, tmp_path) == results
     assert idle.calls == 0
 
 
-def test_a_cell_of_other_settings_is_run_again_and_a_damaged_one_is_named(tmp_path: Path) -> None:
-    cell = tiny(0)
-    write_cell(cell, tmp_path, {"commit": "x", **run_cell(cell)})
-    assert read_cell(cell, tmp_path) is not None
-    assert read_cell(tiny(0, kl_bound=0.1), tmp_path) is None
-    (tmp_path / f"{cell.name}.json").write_text("{")
-    with pytest.raises(StorageError, match=cell.name):
-        read_cell(cell, tmp_path)
+def test_results_of_other_settings_are_ignored_and_damaged_ones_raise(tmp_path: Path) -> None:
+    trial = tiny(0)
+    write_trial(trial, tmp_path, {"commit": "x", **run_trial(trial)})
+    assert read_trial(trial, tmp_path) is not None
+    assert read_trial(tiny(0, kl_bound=0.1), tmp_path) is None
+    (tmp_path / f"{trial.name}.json").write_text("{")
+    with pytest.raises(StorageError, match=trial.name):
+        read_trial(trial, tmp_path)
 
 
 # ---- the search -------------------------------------------------------------------------------
 
 
-def test_every_method_has_as_many_candidates_on_seeds_that_no_figure_uses() -> None:
+def test_all_methods_have_equally_many_candidates_on_seeds_of_no_figure() -> None:
     sizes = {len(each) for of_task in search.CANDIDATES.values() for each in of_task.values()}
     assert len(sizes) == 1
     assert min(search.SEEDS) >= 100
@@ -143,28 +144,28 @@ def test_every_method_has_as_many_candidates_on_seeds_that_no_figure_uses() -> N
                 assert method in search.CANDIDATES[task]
 
 
-def test_the_search_takes_the_candidate_of_the_best_mean(monkeypatch: pytest.MonkeyPatch) -> None:
-    cells = search.search_trials("reaching", "NPALP")
-    assert len({cell.name for of in cells for cell in of}) == len(cells) * len(search.SEEDS)
-    rewards = np.random.default_rng(0).normal(size=(len(cells), len(search.SEEDS)))
+def test_the_search_takes_the_candidate_of_the_best_mean() -> None:
+    trials = search.search_trials("reaching", "NPALP")
+    assert len({trial.name for of in trials for trial in of}) == len(trials) * len(search.SEEDS)
+    rewards = np.random.default_rng(0).normal(size=(len(trials), len(search.SEEDS)))
     rewards[3] = (5.0, -1.0)
     rewards[4] = (1.0, 2.0)
     results = {
-        cell.name: {
+        trial.name: {
             "rows": [
                 {"stochastic": -99.0, "greedy": 0.0},
-                *[{"stochastic": r - 1.0, "greedy": r + 1.0}] * search.COUNTED,
+                *[{"stochastic": r - 1.0, "greedy": r + 1.0}] * 5,
             ]
         }
-        for of_candidate, of_seeds in zip(cells, rewards, strict=True)
-        for cell, r in zip(of_candidate, of_seeds, strict=True)
+        for of_candidate, of_seeds in zip(trials, rewards, strict=True)
+        for trial, r in zip(of_candidate, of_seeds, strict=True)
     }
     found = search.outcome("reaching", "NPALP", results)
     assert found["chosen"] == search.CANDIDATES["reaching"]["NPALP"][3]
     assert found["candidates"][4]["scores"] == [1.0, 2.0]
 
 
-def test_the_committed_search_is_of_the_candidates_of_today() -> None:
+def test_the_committed_search_has_the_present_candidates() -> None:
     file = Path(search.__file__).with_name("search.json")
     content = json.loads(file.read_text())
     assert content["seeds"] == list(search.SEEDS)
@@ -179,21 +180,21 @@ def test_the_committed_search_is_of_the_candidates_of_today() -> None:
     assert search.tuned_options("swing-up", "kreps (default)") == {}
 
 
-def test_the_candidates_mean_what_they_meant_in_the_committed_search() -> None:
-    """It was made when the recipe "observed" was the default, so that no candidate named it."""
-    numbers = {"kl_bound": 1.0, "eta_floor": 0.1, "ridge": 0.1, "imagined": 0}
+def test_the_candidates_have_the_settings_of_the_committed_search() -> None:
+    """At that time the preset now called "single_step" was the default: no candidate named it."""
+    defaults = {"kl_bound": 1.0, "eta_floor": 0.1, "ridge": 0.1, "model_based": None}
     for task, methods in search.CANDIDATES.items():
         for method, candidates in methods.items():
             if METHODS[method].learner != "reps":
                 continue
-            for cells, candidate in zip(
+            for trials, candidate in zip(
                 search.search_trials(task, method), candidates, strict=True
             ):
-                env = gym.make(cells[0].environment)
-                settings = vars(kreps.KREPS(env, **cells[0].options).settings)
-                paper = {"kl_bound": 0.5, "eta_floor": 0.02} if "recipe" in candidate else {}
-                changed = {k: v for k, v in candidate.items() if k != "recipe"}
-                wanted = numbers | paper | changed
+                env = gym.make(trials[0].environment)
+                settings = flat(kreps.KREPS(env, **trials[0].options).settings)
+                paper = {"kl_bound": 0.5, "eta_floor": 0.02} if "preset" in candidate else {}
+                changed = {k: v for k, v in candidate.items() if k != "preset"}
+                wanted = defaults | paper | changed
                 assert {name: settings[name] for name in wanted} == wanted
                 printed = ("embedding", "bounded") if paper else ("change", "map")
                 if method == "REPS, sample model":
@@ -225,41 +226,41 @@ def claim_of(better: str, worse: str | None, kind: Kind = Kind.BETTER, **changes
     return Claim("a claim", "figure-1b", better, worse, changes.get("measure", claims.late), kind)
 
 
-def test_a_claim_is_judged_by_the_interval_of_the_difference() -> None:
+def test_the_verdict_follows_from_the_interval_of_the_difference() -> None:
     rng = np.random.default_rng(1)
     good, bad = rng.normal(1.0, 0.5, 10), rng.normal(0.0, 0.5, 10)
     rows = [*rows_with("A", good.tolist()), *rows_with("B", bad.tolist())]
-    found = judge(claim_of("A", "B"), rows)
+    found = assess(claim_of("A", "B"), rows)
     assert found is not None
     assert found["effect"] == pytest.approx(good.mean() - bad.mean(), abs=1e-4)
     # the percentile bootstrap of a difference of means is close to the normal interval
     width = 1.96 * np.sqrt(good.var() / 10 + bad.var() / 10)
     assert found["high"] - found["low"] == pytest.approx(2 * width, rel=0.1)
     assert found["verdict"] == "confirmed"
-    against = judge(claim_of("B", "A"), rows)
+    against = assess(claim_of("B", "A"), rows)
     assert against is not None
     assert against["verdict"] == "contradicted"
-    as_good = judge(claim_of("B", "A", Kind.AS_GOOD), rows)  # within the margin of 4
+    as_good = assess(claim_of("B", "A", Kind.AS_GOOD), rows)  # within the margin of 4
     assert as_good is not None
     assert as_good["verdict"] == "confirmed"
-    assert judge(claim_of("A", "C"), rows) is None
+    assert assess(claim_of("A", "C"), rows) is None
 
 
-def test_a_claim_may_be_of_one_curve_alone() -> None:
-    gains = judge(claim_of("A", None, measure=claims.later_gain), rows_with("A", [1.0, 2.0, 5.0]))
+def test_a_claim_about_a_single_curve() -> None:
+    gains = assess(claim_of("A", None, measure=claims.later_gain), rows_with("A", [1.0, 2.0, 5.0]))
     assert gains is not None
     assert gains["effect"] == pytest.approx(0.001 * (8.0 - 7.0), abs=1e-4)
     assert gains["comparison"] == "A"
 
 
-def test_curves_are_compared_over_the_iterations_that_both_have() -> None:
+def test_curves_are_compared_over_their_common_iterations() -> None:
     long = rows_with("A", [0.0, 0.0], iterations=20)
     short = rows_with("B", [0.0, 0.0], iterations=15)
-    found = judge(claim_of("A", "B"), [*long, *short])
+    found = assess(claim_of("A", "B"), [*long, *short])
     assert found is not None
     assert found["iterations"] == 15
     assert found["effect"] == 0.0
-    once = judge(claim_of("A", "B"), [*long, *rows_with("B", [0.0, 0.0], iterations=1)])
+    once = assess(claim_of("A", "B"), [*long, *rows_with("B", [0.0, 0.0], iterations=1)])
     assert once is not None
     assert once["iterations"] == 20  # one iteration is all that the other needs
 
@@ -320,22 +321,22 @@ def test_claims_are_written_from_result_files(tmp_path: Path) -> None:
 # ---- executors --------------------------------------------------------------------------------
 
 
-def test_a_dask_cluster_runs_the_same_cells(tmp_path: Path) -> None:
+def test_a_dask_cluster_gives_the_same_results(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
-    cells = [tiny(0), tiny(1)]
-    here = run_trials(cells, Inline(), tmp_path / "here")
+    trials = [tiny(0), tiny(1)]
+    here = run_trials(trials, Inline(), tmp_path / "here")
     with (
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, dashboard_address=None
         ) as cluster,
         executor(1, cluster.scheduler_address) as pool,
     ):
-        there = run_trials(cells, pool, tmp_path / "there")
+        there = run_trials(trials, pool, tmp_path / "there")
     for a, b in zip(here, there, strict=True):
         assert [r["greedy"] for r in a["rows"]] == [r["greedy"] for r in b["rows"]]
 
 
-def test_a_scheduler_that_is_not_there_is_named() -> None:
+def test_an_unreachable_scheduler_raises_with_its_address() -> None:
     pytest.importorskip("distributed")
     with (
         pytest.raises(ConfigurationError, match="nowhere"),
@@ -351,7 +352,7 @@ def results_of(values: dict[str, list[float]]) -> list[dict[str, Any]]:
     return [
         {
             "commit": "abc",
-            "cell": {"task": "swing-up", "method": method, "options": {}},
+            "trial": {"task": "swing-up", "method": method, "options": {}},
             "rows": [
                 {
                     "task": "swing-up",
@@ -371,7 +372,7 @@ def results_of(values: dict[str, list[float]]) -> list[dict[str, Any]]:
     ]
 
 
-def test_the_summary_is_of_the_last_iteration_and_shows_the_worst_seed() -> None:
+def test_the_summary_is_of_the_last_iteration_and_has_the_worst_seed() -> None:
     results = results_of({"A": [-20.0, -22.0, -30.0], "B": [-5.0]})
     summary = summarise(rows_of(results))
     assert summary["A"]["stochastic"]["mean"] == pytest.approx(-24.0)
@@ -384,7 +385,7 @@ def test_the_summary_is_of_the_last_iteration_and_shows_the_worst_seed() -> None
     )
 
 
-def test_written_results_hold_every_row_and_where_they_come_from(tmp_path: Path) -> None:
+def test_result_files_hold_all_rows_and_their_provenance(tmp_path: Path) -> None:
     results = results_of({"A": [-20.0, -22.0]})
     results[1]["commit"] = "def"
     summary = write_results(tmp_path, "try", "kreps reproduce try", results)
@@ -403,21 +404,21 @@ def test_written_results_hold_every_row_and_where_they_come_from(tmp_path: Path)
     assert (tmp_path / "try.md").read_text().strip() == markdown_table(summary)
 
 
-def test_rows_of_several_tasks_are_named_by_both() -> None:
+def test_rows_of_several_tasks_are_named_by_method_and_task() -> None:
     rows = [{"task": "a", "method": "m"}, {"task": "b", "method": "m"}]
     assert [row["method"] for row in named_rows(rows)] == ["m, a", "m, b"]
     assert [row["method"] for row in named_rows(rows[:1])] == ["m"]
 
 
-def test_a_figure_is_written_with_its_files(tmp_path: Path) -> None:
+def test_a_figure_is_written_as_csv_json_markdown_and_png(tmp_path: Path) -> None:
     results = []
     for seed in (0, 1):
         for method, options in (
             ("kernel REPS", TINY),
             ("value iteration on a grid (simulator set to any state)", {"grid_states": 6}),
         ):
-            cell = trial_of("swing-up", method, seed, options, iterations=2, episodes=(2, 2))
-            results.append({"commit": "abc", **run_cell(cell)})
+            trial = trial_of("swing-up", method, seed, options, iterations=2, episodes=(2, 2))
+            results.append({"commit": "abc", **run_trial(trial)})
     paths = write_figure(tmp_path, "figure-1b", "a command", results)
     assert [path.suffix for path in paths] == [".csv", ".json", ".md", ".png"]
     assert all(path.stat().st_size > 0 for path in paths)
@@ -425,19 +426,19 @@ def test_a_figure_is_written_with_its_files(tmp_path: Path) -> None:
     assert len(rows_of(results)) == 6  # the grid needs one iteration only
 
 
-def test_the_features_of_the_images_are_drawn(tmp_path: Path) -> None:
+def test_the_picture_of_the_image_features_is_written(tmp_path: Path) -> None:
     path = draw_features(tmp_path / "new" / "figure-2a.png")
     assert path.read_bytes()[:4] == b"\x89PNG"
 
 
-def test_cells_of_the_same_work_are_run_once(tmp_path: Path) -> None:
+def test_trials_that_differ_in_their_names_only_are_run_once(tmp_path: Path) -> None:
     same = "observed actions only"
-    cells = [tiny(0), tiny(0, same), tiny(1)]
-    assert cells[0].work == cells[1].work != cells[2].work
+    trials = [tiny(0), tiny(0, same), tiny(1)]
+    assert trials[0].work == trials[1].work != trials[2].work
     inline = Inline()
-    results = run_trials(cells[:2], inline, tmp_path)
+    results = run_trials(trials[:2], inline, tmp_path)
     assert inline.calls == 1
     assert [row["method"] for row in rows_of(results)] == ["kernel REPS"] * 2 + [same] * 2
-    (tmp_path / f"{cells[0].name}.json").unlink()
-    assert run_trials(cells, inline, tmp_path)[:2] == results
+    (tmp_path / f"{trials[0].name}.json").unlink()
+    assert run_trials(trials, inline, tmp_path)[:2] == results
     assert inline.calls == 2  # only the one that differs

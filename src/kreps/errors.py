@@ -26,8 +26,8 @@ class EnvironmentFailure(KrepsError, RuntimeError):
     """The environment raised during a roll-out; what was learnt before is untouched."""
 
 
-class CellFailure(KrepsError, RuntimeError):
-    """Cells of an experiment that raised; the others are kept."""
+class TrialFailure(KrepsError, RuntimeError):
+    """At least one trial of an experiment raised; the results of the others are kept."""
 
 
 class NumericalError(KrepsError, ArithmeticError):

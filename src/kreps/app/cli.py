@@ -326,8 +326,8 @@ def reproduce(
 ) -> None:
     """Repeat a figure of the paper over many seeds, draw it and test the paper's claims.
 
-    Each cell (method x task x seed) is kept when it is done: stop at any time and call it again.
-    Figures share cells, so [bold]all[/bold] costs less than its parts.
+    Each trial (method x task x seed) is kept when it is done: stop at any time and call it again.
+    Figures share trials, so [bold]all[/bold] costs less than its parts.
     """
     known = (*FIGURES, *PICTURES, "all", *EXTRA_EXPERIMENTS)
     if figure not in known:
@@ -336,17 +336,17 @@ def reproduce(
     command = f"kreps reproduce {figure} --trials {trials}"
     if iterations is not None:
         command += f" --iterations {iterations}"
-    cells = {
+    of_figures = {
         name: figure_trials(name, trials, iterations) for name in wanted if name not in PICTURES
     }
     results = []
-    if cells:
+    if of_figures:
         with executor(workers, scheduler) as pool:
-            every_cell = [cell for of_figure in cells.values() for cell in of_figure]
-            results = run_trials(every_cell, pool, out / "cells")
+            every_trial = [trial for of_figure in of_figures.values() for trial in of_figure]
+            results = run_trials(every_trial, pool, out / "trials")
     for name in wanted:
         if name not in PICTURES:
-            mine = {cell.name for cell in cells[name]}
+            mine = {trial.name for trial in of_figures[name]}
             chosen = [result for result in results if name_of(result) in mine]
             for path in write_figure(out, name, command, chosen):
                 say(f"wrote {path}")
@@ -374,15 +374,15 @@ def search(
         raise ConfigurationError(
             f"task {unknown[0]!r} is unknown; choose some of {', '.join(CANDIDATES)}"
         )
-    cells = [
-        cell
+    trials = [
+        trial
         for task in tasks or CANDIDATES
         for method in CANDIDATES[task]
         for of_candidate in search_trials(task, method)
-        for cell in of_candidate
+        for trial in of_candidate
     ]
     with executor(workers, scheduler) as pool:
-        results = run_trials(cells, pool, out / "cells" / "search")
+        results = run_trials(trials, pool, out / "trials" / "search")
     command = " ".join(["kreps search", *(tasks or ())])
     say(f"wrote {write_search(out / 'search.json', command, tasks or list(CANDIDATES), results)}")
 

@@ -7,7 +7,7 @@ REFERENCE_RESTART_PROBABILITY = 0.02
 REFERENCE_REWARDS: dict[str, dict[str, float]] = {
     "kreps/SwingUp-v0": {
         "optimum (dynamic programming)": -21.2,
-        "the lean (constant torque)": -61.9,
+        "local optimum (constant torque)": -61.9,
         "zero torque": -99.0,
         "uniformly random torque": -101.0,
     },
@@ -16,8 +16,8 @@ REFERENCE_REWARDS: dict[str, dict[str, float]] = {
         "random torques (0.5 N m)": -0.8,
     },
 }
-"""From best to worst, at least two.  The lean is the local optimum in which many learners stop:
+"""From best to worst, at least two.  Many learners stop in the constant-torque local optimum: the
 full torque held to one side.  Tests measure all but the best, which `benchmarks/` computes."""
 
 REFERENCE_REWARDS["kreps/ImageSwingUp-v0"] = REFERENCE_REWARDS["kreps/SwingUp-v0"]
-"""The same process seen by a camera: what full knowledge of its state reaches bounds it."""
+"""The same process observed by a camera: the optimum with full state information is a bound."""

@@ -1,1 +1,1 @@
-"""Comparisons over many seeds: what is compared, how it is run, what is written."""
+"""Comparisons of methods over many seeds: definitions, execution and result files."""

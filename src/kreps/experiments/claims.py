@@ -1,12 +1,14 @@
-"""The paper's claims, each as a comparison of groups of seeds with an interval and a verdict.
+"""The paper's claims, each tested by a comparison of two groups of seeds.
 
-A claim is a difference of means between two curves, or a gain within one, in reward per step and so
-that a positive one supports the paper.  Its 95 % interval is a percentile bootstrap over seeds,
-resampled within each curve.  *Confirmed*: the interval lies above the limit; *contradicted*: below;
-otherwise *not separated*.  The limit is zero for "better"; for "as good as" it is minus a margin
-of a twentieth of the way from the first policy to the best known one.  A claim that two curves end
-equal, or that one has stopped, is confirmed where the interval lies within that margin around
-zero, and contradicted where it lies outside.
+The effect is a difference of means between two curves, or a gain within one curve, in reward per
+step.  Its sign is chosen so that a positive effect supports the paper.  Its 95 % interval is a
+percentile bootstrap over seeds, resampled within each curve.
+
+A claim is *confirmed* if the interval lies above a limit, *contradicted* if it lies below, and *not
+separated* otherwise.  The limit is zero for "better".  For "as good as" it is minus a margin: a
+twentieth of the difference between the first policy and the best known one.  A claim that two
+curves end equal, or that one no longer changes, is confirmed if the interval lies within the margin
+around zero, and contradicted if it lies outside.
 """
 
 from __future__ import annotations
@@ -33,16 +35,16 @@ RESAMPLES = 9999
 
 Rows = Sequence[Mapping[str, str]]
 Measure = Callable[[Rows], float]
-"""Of the rows of one seed, in the order of their iterations."""
+"""Maps the rows of one seed, in the order of their iterations, to a number."""
 
 EARLY = 4
-"""Iterations that count as the first ones."""
+"""Number of iterations at the start over which `early` averages."""
 
 LATE = 5
-"""Iterations, from the last one back, that count as the end."""
+"""Number of iterations at the end over which `late` averages."""
 
 MARGINS = {"figure-1a": 0.04, "figure-1b": 4.0, "figure-2b": 4.0}
-"""A twentieth of the way from the first policy to the best known one, rounded."""
+"""Margins in reward per step: a twentieth of best known minus first policy, rounded."""
 
 
 def _mean(rows: Rows, name: str) -> float:
@@ -65,23 +67,23 @@ def late_greedy(rows: Rows) -> float:
 
 
 def whole(rows: Rows) -> float:
-    """Evaluated reward with exploration, mean over all iterations: how fast it learnt."""
+    """Evaluated reward with exploration, mean over all iterations: measures speed of learning."""
     return _mean(rows, "stochastic")
 
 
 def later_gain(rows: Rows) -> float:
-    """Gain from the iterations after the first ones to the last ones, with exploration."""
+    """`late` minus the same mean over the `LATE` iterations that follow the first `EARLY` ones."""
     return late(rows) - _mean(rows[EARLY : EARLY + LATE], "stochastic")
 
 
 def steadiness(rows: Rows) -> float:
-    """Minus the mean loss between iterations (a gain counts as zero), over the second half."""
+    """Minus the mean drop between iterations (a rise counts as zero), over the second half."""
     values = np.array([float(row["stochastic"]) for row in rows[len(rows) // 2 :]])
     return float(np.mean(np.minimum(np.diff(values), 0.0)))
 
 
 class Kind(StrEnum):
-    """What a claim says of the difference."""
+    """The kind of difference that a claim asserts."""
 
     BETTER = "better"
     AS_GOOD = "at least as good"
@@ -93,12 +95,12 @@ class Claim:
     """One claim of the paper.
 
     Attributes:
-        text: what the paper says.
-        figure: whose result file holds the rows.
-        better, worse: curves as the figure names them; ``better`` should have the larger measure.
-            Where ``worse`` is None the measure of ``better`` is compared with zero.
-        measure: of one seed.
-        kind: of the claim.
+        text: the claim in words.
+        figure: key of `FIGURES`; its result file holds the rows.
+        better, worse: names of curves in the figure.  The claim is that ``better`` has the larger
+            measure.  If ``worse`` is None, the measure of ``better`` is compared with zero.
+        measure: is computed for each seed.
+        kind: of difference.
     """
 
     text: str
@@ -180,7 +182,7 @@ CLAIMS = (
 
 
 def by_seed(rows: Rows, curve: str, measure: Measure, iterations: int) -> FloatArray:
-    """The measure of each seed of a curve, over so many iterations."""
+    """The measure of each seed of a curve, (seeds,), from its first ``iterations`` rows."""
     mine = [r for r in rows if r["method"] == curve and int(r["iteration"]) <= iterations]
     seeds = sorted({int(row["seed"]) for row in mine})
     of_seed = [
@@ -191,13 +193,19 @@ def by_seed(rows: Rows, curve: str, measure: Measure, iterations: int) -> FloatA
 
 
 def common_iterations(rows: Rows, curves: Sequence[str]) -> int:
-    """How many iterations curves are compared over: all that both have, if they have several."""
+    """The number of iterations that all curves have; curves with one iteration do not count."""
     last = [max((int(r["iteration"]) for r in rows if r["method"] == c), default=0) for c in curves]
     return min((number for number in last if number > 1), default=1)
 
 
 def verdict(low: float, high: float, kind: Kind, margin: float) -> str:
-    """What an interval says of a claim."""
+    """The verdict on a claim.
+
+    Args:
+        low, high: ends of the interval of the effect.
+        kind: of the claim.
+        margin: in the unit of the effect; without influence on ``Kind.BETTER``.
+    """
     if kind is Kind.EQUAL:
         if -margin <= low and high <= margin:
             return "confirmed"
@@ -206,9 +214,17 @@ def verdict(low: float, high: float, kind: Kind, margin: float) -> str:
     return "confirmed" if low > limit else "contradicted" if high < limit else "not separated"
 
 
-def judge(claim: Claim, rows: Rows) -> dict[str, Any] | None:
-    """Effect, interval and verdict; None if the rows hold fewer than two seeds of a curve."""
-    from scipy.stats import bootstrap  # a third of the command line's import, for this alone
+def assess(claim: Claim, rows: Rows) -> dict[str, Any] | None:
+    """Effect, interval and verdict of a claim.
+
+    Args:
+        claim: to be tested.
+        rows: of its figure, as ``csv.DictReader`` reads them.
+
+    Returns:
+        A row of ``claims.json``; None if the rows hold fewer than two seeds of a curve.
+    """
+    from scipy.stats import bootstrap  # slow to import, and only needed here
 
     rows = named_rows(rows)
     curves = [claim.better] if claim.worse is None else [claim.better, claim.worse]
@@ -217,8 +233,8 @@ def judge(claim: Claim, rows: Rows) -> dict[str, Any] | None:
     if min(len(sample) for sample in samples) < 2:
         return None
 
-    def effect(*drawn: FloatArray, axis: int = -1) -> FloatArray:
-        means = [each.mean(axis=axis) for each in drawn]
+    def effect(*resampled: FloatArray, axis: int = -1) -> FloatArray:
+        means = [each.mean(axis=axis) for each in resampled]
         return means[0] if len(means) == 1 else means[0] - means[1]
 
     found = bootstrap(
@@ -247,20 +263,27 @@ def judge(claim: Claim, rows: Rows) -> dict[str, Any] | None:
 
 
 def write_claims(folder: Path) -> list[Path]:
-    """``claims.json`` and ``claims.md`` from the result files that the folder holds."""
-    judged = []
+    """Write ``claims.json`` and ``claims.md`` from the result files in a folder.
+
+    Returns:
+        Their paths; nothing if the folder holds no result file of a claim.
+
+    Raises:
+        StorageError: a result file is damaged, or a file cannot be written.
+    """
+    assessed = []
     for claim in CLAIMS:
         path = folder / f"{claim.figure}.csv"
         if path.exists():
             try:
                 with open(path, newline="") as file:
-                    judged.append(judge(claim, list(csv.DictReader(file))))
+                    assessed.append(assess(claim, list(csv.DictReader(file))))
             except (KeyError, ValueError, TypeError) as error:
                 raise StorageError(
                     f"{path} is damaged or foreign ({error!r}); make it again with "
                     f"`kreps reproduce {claim.figure}`"
                 ) from error
-    found = [each for each in judged if each is not None]
+    found = [each for each in assessed if each is not None]
     if not found:
         return []
     write_atomically(folder / "claims.json", (json.dumps(found, indent=1) + "\n").encode())
@@ -268,10 +291,10 @@ def write_claims(folder: Path) -> list[Path]:
     return [folder / "claims.json", folder / "claims.md"]
 
 
-def claims_table(judged: Sequence[Mapping[str, Any]]) -> str:
-    """The claims as the documentation shows them."""
+def claims_table(assessed: Sequence[Mapping[str, Any]]) -> str:
+    """The documentation's table of all claims."""
     rows = []
-    for each in judged:
+    for each in assessed:
         places = 1 if max(abs(each["low"]), abs(each["high"])) >= 1 else 3
         effect, low, high = (f"{each[name]:+.{places}f}" for name in ("effect", "low", "high"))
         kind = each["kind"] + (f" (margin {each['margin']:g})" if each["margin"] else "")

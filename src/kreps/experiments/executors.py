@@ -1,4 +1,4 @@
-"""Where cells run: processes of this machine, or a Dask cluster."""
+"""Executors of trials: processes of this machine, or a Dask cluster."""
 
 from __future__ import annotations
 
@@ -12,10 +12,15 @@ from kreps.errors import ConfigurationError
 
 @contextmanager
 def executor(workers: int, scheduler: str | None) -> Iterator[Executor]:
-    """An executor of ``workers`` processes, or that of the Dask scheduler at an address.
+    """An executor that lives as long as the context.
+
+    Args:
+        workers: processes on this machine; unused with a scheduler.
+        scheduler: address of a Dask scheduler, such as ``tcp://head-node:8786``; None stays on
+            this machine.
 
     Raises:
-        ConfigurationError: Dask is not installed, or nothing answers at the address.
+        ConfigurationError: Dask is not installed, or there is no scheduler at the address.
     """
     if scheduler is None:
         with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:

@@ -1,4 +1,4 @@
-"""Result files of a figure: every row, a summary, a table and the picture."""
+"""Result files of a figure: all rows as CSV, a summary as JSON, tables as Markdown, a picture."""
 
 from __future__ import annotations
 
@@ -27,19 +27,24 @@ from kreps.versions import versions
 
 
 def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """One row per method, seed and iteration."""
+    """The rows of all trials: one per method, seed and iteration."""
     return [row for result in results for row in result["rows"]]
 
 
 def named_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The rows with their curve's name as ``method``: it names the task where there are several."""
+    """The rows with ``method`` followed by the task, if the rows are of several tasks."""
     if len({row["task"] for row in rows}) == 1:
         return [{**row} for row in rows]
     return [{**row, "method": f"{row['method']}, {row['task']}"} for row in rows]
 
 
 def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
-    """Per curve, at its last iteration: mean, twice the standard error and worst seed."""
+    """Evaluated reward per step at the last iteration of each curve.
+
+    Returns:
+        Per curve: mean, twice its standard error, smallest and all values over seeds, for the
+        stochastic and the greedy policy; and the mean CPU seconds of an update.
+    """
     rows = named_rows(rows)
     summary = {}
     for method in dict.fromkeys(row["method"] for row in rows):
@@ -67,7 +72,17 @@ def summarise(rows: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
 def write_results(
     folder: Path, name: str, command: str, results: Sequence[Mapping[str, Any]]
 ) -> dict[str, dict[str, Any]]:
-    """``NAME.csv`` with every row, ``NAME.json`` with summary, command and commit, ``NAME.md``."""
+    """Write NAME.csv with all rows, NAME.json with summary and provenance, and NAME.md.
+
+    Args:
+        folder: of the files, which exists.
+        name: of the experiment.
+        command: that made the results.
+        results: of the trials.
+
+    Returns:
+        The summary.
+    """
     rows = rows_of(results)
     columns = list(dict.fromkeys(column for row in rows for column in row))
     text = io.StringIO()
@@ -78,11 +93,11 @@ def write_results(
     )
     write_atomically(folder / f"{name}.csv", text.getvalue().encode())
     summary = summarise(rows)
-    cells = [result["cell"] for result in results]
+    trials = [result["trial"] for result in results]
     content = {
         "command": command,
         "commit": commits_of(results),
-        "options": {f"{cell['task']}: {cell['method']}": cell["options"] for cell in cells},
+        "options": {f"{t['task']}: {t['method']}": t["options"] for t in trials},
         "versions": versions(),
         "summary": summary,
     }
@@ -95,7 +110,7 @@ TABLE_HEADINGS = ("method", "stochastic policy", "worst seed", "greedy policy", 
 
 
 def table_rows(summary: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
-    """The summary in words: a row per method under `TABLE_HEADINGS`."""
+    """The summary as text: one row per method, columns as in `TABLE_HEADINGS`."""
     rows = []
     for method, entry in summary.items():
         places = 2 if abs(entry["greedy"]["mean"]) >= 1.0 else 3
@@ -109,7 +124,7 @@ def table_rows(summary: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
 
 
 def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
-    """The summary as the documentation shows it, with the CPU seconds of an update."""
+    """The documentation's table of a summary, with iterations and CPU seconds per update."""
     rows = [
         [*row, f"{entry['iteration']}", f"{entry['mean_update_cpu_seconds']:.2f}"]
         for row, entry in zip(table_rows(summary), summary.values(), strict=True)
@@ -118,18 +133,28 @@ def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
 
 
 MARKS = (3000, 5000, 6000, 8000, 20_000)
-"""Environment steps at which learning curves are read off."""
+"""Numbers of environment steps at which the tables give the reward."""
 
 
 def at_most(curve: Sequence[Mapping[str, Any]], steps: float) -> Mapping[str, Any]:
-    """The row of the last policy that was learnt from at most so many steps."""
+    """The row of the latest policy that was learnt from at most so many environment steps."""
     return max(
         (row for row in curve if float(row["steps"]) <= steps), key=lambda row: float(row["steps"])
     )
 
 
-def read_off(curves: Sequence[Sequence[Mapping[str, Any]]], name: str, mark: float) -> str:
-    """Mean and, in brackets, worst seed at a mark; a dash where the curves end before it."""
+def value_at(curves: Sequence[Sequence[Mapping[str, Any]]], name: str, mark: float) -> str:
+    """Mean over seeds and, in brackets, the worst seed, at a number of environment steps.
+
+    Args:
+        curves: the rows of each seed.
+        name: column that is read.
+        mark: number of steps.
+
+    Returns:
+        A dash if some curve starts after the mark, or if the curves end before it (at fewer than
+        95 % of it on average).
+    """
     steps = [[float(row["steps"]) for row in curve] for curve in curves]
     if max(map(min, steps)) > mark or np.mean([max(s) for s in steps]) < 0.95 * mark:
         return "–"
@@ -139,15 +164,15 @@ def read_off(curves: Sequence[Sequence[Mapping[str, Any]]], name: str, mark: flo
 
 
 def steps_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Mean and worst seed of the policies learnt from at most some numbers of steps."""
+    """The documentation's table of reward by environment steps: mean and worst seed at `MARKS`."""
     lines = []
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row for row in rows if row["method"] == method]
         seeds = sorted({int(row["seed"]) for row in mine})
         curves = [[row for row in mine if int(row["seed"]) == seed] for seed in seeds]
         for name in ("stochastic", "greedy"):
-            read = (read_off(curves, name, mark) for mark in MARKS)
-            lines.append([f"{method}, {name}", *read])
+            values = (value_at(curves, name, mark) for mark in MARKS)
+            lines.append([f"{method}, {name}", *values])
     return markdown(["mean (worst seed)", *(f"{mark} steps" for mark in MARKS)], lines)
 
 
@@ -155,26 +180,39 @@ TITLES = {
     "figure-1a": "Reaching: learning progress of the methods (Fig. 1a)",
     "figure-1b": "Swing-up: learning progress of the methods (Fig. 1b)",
     "figure-2b": "Swing-up from images and from joint values (Fig. 2b)",
-    "swing-up": "kreps/SwingUp-v0: every seed",
-    "untuned": "KREPS(env) and nothing else: every seed",
-    "ablation": "Each part of the default taken back alone: every seed",
-    "low-rank": "Exact and of low rank: every seed",
-    "forgetting": "Swing-up with and without a window of 30 roll-outs",
+    "swing-up": "kreps/SwingUp-v0: all seeds",
+    "untuned": "KREPS(env) without further arguments: all seeds",
+    "ablation": "The default with one part replaced: all seeds",
+    "low-rank": "Exact and low-rank updates: all seeds",
+    "forgetting": "Swing-up with and without a replay window of 30 rollouts",
 }
 SEED_BY_SEED = ("swing-up", "untuned", "ablation", "low-rank")
+"""Experiments whose picture has a panel per method, with a curve per seed."""
+
 STEP_BY_STEP = ("swing-up", "untuned", "ablation")
+"""Experiments with a table of reward by environment steps."""
 
 
 def write_figure(
     folder: Path, name: str, command: str, results: Sequence[Mapping[str, Any]]
 ) -> list[Path]:
-    """The result files of a figure, and its picture."""
-    from kreps import plotting
+    """Write the result files of a figure and its picture.
+
+    Args:
+        folder: of the files, which exists.
+        name: key of `TITLES`.
+        command: that made the results.
+        results: of the trials.
+
+    Returns:
+        The paths of the CSV, JSON, Markdown and PNG files.
+    """
+    from kreps import plotting  # Matplotlib is slow to import
     from kreps.experiments import plots
 
     write_results(folder, name, command, results)
     rows = named_rows(rows_of(results))
-    if name in STEP_BY_STEP:  # of the numbers as the file has them, rounded: they can be read again
+    if name in STEP_BY_STEP:  # from the rounded numbers of the file, so that it can be repeated
         with open(folder / f"{name}.csv", newline="") as file:
             table = steps_table(named_rows(list(csv.DictReader(file))))
         write_atomically(folder / f"{name}-steps.md", (table + "\n").encode())
@@ -185,16 +223,20 @@ def write_figure(
     if name in SEED_BY_SEED:
         figure = plots.comparison(rows, references, TITLES[name], source)
     else:
-        some = next(iter(references.values()))
+        of_first = next(iter(references.values()))
         known = list(METHODS) if rows[0]["method"] in METHODS else []
-        figure = plots.learning_curves(rows, some, TITLES[name], source, known)
+        figure = plots.learning_curves(rows, of_first, TITLES[name], source, known)
     picture = plotting.save(figure, folder / f"{name}.png")
     return [folder / f"{name}.{ending}" for ending in ("csv", "json", "md")] + [picture]
 
 
 def draw_features(path: Path) -> Path:
-    """Fig. 2a: what the learner sees of a roll-out of its first policy."""
-    from kreps import plotting
+    """Draw Fig. 2a: the images of a rollout of the first policy, and their differences.
+
+    Args:
+        path: of the picture; its folder is made if there is none.
+    """
+    from kreps import plotting  # Matplotlib is slow to import
     from kreps.experiments import plots
 
     env = gym.make("kreps/ImageSwingUp-v0")

@@ -1,4 +1,4 @@
-"""Pictures of experiments: every seed of a method, means of several methods, image features."""
+"""Pictures of experiments: learning curves over many seeds, and the features of the images."""
 
 from __future__ import annotations
 
@@ -21,14 +21,16 @@ def comparison(
     title: str,
     source: str,
 ) -> Figure:
-    """Every seed of every method against environment steps, stochastic above greedy, and means.
+    """A curve per seed against environment steps, and their mean, in two panels per method.
+
+    The upper panel shows the stochastic policy, the lower one the greedy policy.
 
     Args:
         rows: of an experiment, one per method, seed and iteration.
-        references: values to draw as lines, by name, for each method; where they differ, so do
-            the tasks, and each has a scale of its own.
+        references: per method, values that are drawn as lines, by name.  If they differ between
+            methods, the methods are on different tasks and their panels have different scales.
         title: of the figure.
-        source: command and commit that made it, printed below.
+        source: command and commit, printed below.
     """
     methods = list(dict.fromkeys(row["method"] for row in rows))
     across = min(len(methods), 4)
@@ -79,10 +81,11 @@ def _draw_seeds(axes: Axes, rows: Sequence[Mapping[str, Any]], name: str) -> Non
 
 
 PANELS = (
-    ("training_reward", "iteration", "As in the paper: training roll-outs"),
+    ("training_reward", "iteration", "As in the paper: training rollouts"),
     ("stochastic", "steps", "Evaluated, with exploration"),
     ("greedy", "steps", "Evaluated, without exploration"),
 )
+"""Column, horizontal axis and title of each panel."""
 
 
 def learning_curves(
@@ -92,28 +95,29 @@ def learning_curves(
     source: str,
     known: Sequence[str] = (),
 ) -> Figure:
-    """Mean and twice the standard error of every method: by iteration, and by environment steps.
+    """Mean and twice the standard error of each method, by iteration and by environment steps.
 
-    A method with one iteration only is a level line, in the first panel at its evaluated reward.
+    A method with a single iteration is drawn as a horizontal line, in the first panel at its
+    evaluated reward.
 
     Args:
         rows: of a figure, one per method, seed and iteration.
         references: values to draw as lines, by name.
         title: of the figure.
-        source: command and commit that made it, printed below.
-        known: methods that keep their colour from figure to figure.
+        source: command and commit, printed below.
+        known: methods with the same colour in all figures.
     """
     methods = list(dict.fromkeys(row["method"] for row in rows))
-    places = {name: i for i, name in enumerate(dict.fromkeys([*known, *methods]))}
+    index = {name: i for i, name in enumerate(dict.fromkeys([*known, *methods]))}
     with rc_context(STYLE):
         figure = Figure(figsize=(13.0, 5.0))
         plots = figure.subplots(1, len(PANELS), sharey=True)
         for method in methods:
-            colour = COLOURS[places[method] % len(COLOURS)]
-            line = LINES[places[method] % len(LINES)]
+            colour = COLOURS[index[method] % len(COLOURS)]
+            line = LINES[index[method] % len(LINES)]
             mine = [row for row in rows if row["method"] == method]
             for axes, (value, by, _) in zip(plots, PANELS, strict=True):
-                _draw_mean(axes, mine, value, by, method, colour, line)
+                _draw_mean(axes, mine, value, by, method, color=colour, ls=line)
         shown = [row[name] for row in rows for name in ("stochastic", "greedy")]
         low, high = min([*references.values(), *_quantiles(shown)]), max(references.values())
         for axes, (_, by, heading) in zip(plots, PANELS, strict=True):
@@ -142,14 +146,13 @@ def _draw_mean(
     value: str,
     by: str,
     name: str,
-    colour: str,
-    line: Any,
+    **look: Any,
 ) -> None:
-    """One curve with its band; a level line if there is one iteration only."""
+    """One curve with its band; a horizontal line if there is a single iteration."""
     iterations = sorted({row["iteration"] for row in rows})
     once = len(iterations) == 1
     if once and value == "training_reward":
-        value = "stochastic"  # no roll-outs of a policy were trained on
+        value = "stochastic"  # its training data is not from a policy
     columns = [[row for row in rows if row["iteration"] == i] for i in iterations]
     x = np.array([np.mean([row[by] for row in column]) for column in columns])
     mean = np.array([np.mean([row[value] for row in column]) for column in columns])
@@ -160,20 +163,20 @@ def _draw_mean(
         ]
     )
     if once:
-        axes.axhline(mean[0], color=colour, ls=line, lw=1.6, label=f"{name}, one iteration")
-        axes.axhspan(mean[0] - error[0], mean[0] + error[0], color=colour, alpha=0.15, lw=0)
+        axes.axhline(mean[0], label=f"{name}, one iteration", lw=1.6, **look)
+        axes.axhspan(mean[0] - error[0], mean[0] + error[0], color=look["color"], alpha=0.15, lw=0)
         return
-    axes.plot(x, mean, color=colour, ls=line, lw=1.6, label=name)
-    axes.fill_between(x, mean - error, mean + error, color=colour, alpha=0.18, lw=0)
+    axes.plot(x, mean, label=name, lw=1.6, **look)
+    axes.fill_between(x, mean - error, mean + error, color=look["color"], alpha=0.18, lw=0)
 
 
 def image_features(observations: FloatArray, times: Sequence[float], pixels: int) -> Figure:
-    """Images above their differences to the one before (Fig. 2a).
+    """Images, and below them their differences to the previous image (Fig. 2a).
 
     Args:
-        observations: (m, 2 pixels^2).
+        observations: (m, 2 pixels^2) images and differences.
         times: (m,) in s.
-        pixels: of each side of an image.
+        pixels: number along each side of an image.
     """
     with rc_context(STYLE):
         figure = Figure(figsize=(1.5 * len(times), 3.5))

@@ -1,8 +1,7 @@
-"""Runs cells on any executor; what is done stays done."""
+"""Runs trials on any executor and keeps each result in a file as soon as it is there."""
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
@@ -16,17 +15,25 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from kreps.errors import CellFailure
+from kreps.errors import TrialFailure
+from kreps.experiments.provenance import commit
 from kreps.experiments.search import tuned_options
 from kreps.experiments.specs import EXTRA_EXPERIMENTS, FIGURES, FIRST_SEED, TASKS
-from kreps.experiments.trials import Trial, read_cell, run_cell, trial_of, write_cell
+from kreps.experiments.trials import Trial, read_trial, run_trial, trial_of, write_trial
 from kreps.learning.evaluate import EPISODES
+
+Result = dict[str, Any]
 
 
 def figure_trials(figure: str, trials: int, iterations: int | None) -> list[Trial]:
-    """The cells that a figure shows: ``trials`` seeds of each of its curves.
+    """The trials of a figure, all curves of one seed before those of the next.
 
-    They come seed by seed, so that partial results compare.
+    In this order the results of an unfinished experiment can already be compared.
+
+    Args:
+        figure: key of `FIGURES` or `EXTRA_EXPERIMENTS`.
+        trials: seeds of each curve.
+        iterations: policy updates; None takes the number that each task prescribes.
     """
     first = FIRST_SEED.get(figure, 0)
     return [
@@ -43,18 +50,58 @@ def figure_trials(figure: str, trials: int, iterations: int | None) -> list[Tria
     ]
 
 
-def run_trials(cells: Sequence[Trial], executor: Executor, folder: Path) -> list[dict[str, Any]]:
-    """The result of each cell; what is not in the folder yet is run, and kept when it is there.
+class _ResultFolder:
+    """The results of some trials: those in the folder, and new ones with a progress display."""
 
-    Cells of the same work under different names are run once.
-    A cell that fails does not keep the others from being run.
+    def __init__(self, trials: Sequence[Trial], folder: Path, bar: Progress) -> None:
+        self.trials = list({trial.name: trial for trial in trials}.values())
+        self.folder, self.bar = folder, bar
+        self.results: dict[str, Result] = {}
+        for trial in self.trials:
+            if (result := read_trial(trial, folder)) is not None:
+                self.results[trial.name] = result
+        self.missing: dict[str, list[Trial]] = {}
+        """Trials without a result, by their work."""
+        for trial in self.trials:
+            if trial.name not in self.results:
+                self.missing.setdefault(trial.work, []).append(trial)
+        self.count = len(self.trials)
+        self.display = bar.add_task(
+            "trials", total=self.count, completed=len(self.results), last=""
+        )
+
+    def keep(self, work: str, result: Mapping[str, Any]) -> None:
+        """Write the result of all trials with this work."""
+        for trial in self.missing[work]:
+            self.results[trial.name] = renamed = trial.renamed(result)
+            write_trial(trial, self.folder, renamed)
+            self.bar.update(self.display, advance=1, last=trial.name)
+            if not self.bar.console.is_terminal:  # a log file: one line per trial
+                done = self.bar.tasks[0].completed
+                print(f"{done:g}/{self.count} trials: {trial.name}", flush=True)
+
+    def keep_known_work(self) -> None:
+        """Take over results of trials that differ from a missing one in their names only."""
+        known = {t.work: self.results[t.name] for t in self.trials if t.name in self.results}
+        for work in self.missing.keys() & known.keys():
+            self.keep(work, known[work])
+            del self.missing[work]
+
+
+def run_trials(trials: Sequence[Trial], executor: Executor, folder: Path) -> list[Result]:
+    """The result of each trial, from its file in the folder or by running it.
+
+    Trials that differ in their displayed names only are run once.  Each result is written when it
+    arrives.  If a trial fails, the others are run all the same.
+
+    Args:
+        trials: in the order of the results; repeated ones count once.
+        executor: runs `run_trial`.
+        folder: of the result files.
 
     Raises:
-        CellFailure: some failed; the first error is its cause.
+        TrialFailure: at least one trial failed; the error of the first one is its cause.
     """
-    cells = list({cell.name: cell for cell in cells}.values())
-    results = {cell.name: read_cell(cell, folder) for cell in cells}
-    left = [cell for cell in cells if results[cell.name] is None]
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
@@ -63,62 +110,33 @@ def run_trials(cells: Sequence[Trial], executor: Executor, folder: Path) -> list
         TextColumn("{task.fields[last]}"),
     )
     with bar:
-        task = bar.add_task("cells", total=len(cells), completed=len(cells) - len(left), last="")
-        failures: dict[str, Exception] = {}
-        source = commit()  # the code that is about to run, whatever happens to the tree meanwhile
-        done = {cell.work: result for cell in cells if (result := results[cell.name])}
-        same: dict[str, list[Trial]] = {}
-        for cell in left:
-            same.setdefault(cell.work, []).append(cell)
-
-        def keep(work: str, fresh: Mapping[str, Any]) -> None:
-            for cell in same[work]:
-                results[cell.name] = result = cell.named(fresh)
-                write_cell(cell, folder, result)
-                bar.update(task, advance=1, last=cell.name)
-                if not bar.console.is_terminal:  # a log: a line each
-                    print(f"{bar.tasks[0].completed:g}/{len(cells)} cells: {cell.name}", flush=True)
-
-        for work in same.keys() & done.keys():
-            keep(work, done[work])
-        running = {
-            executor.submit(run_cell, mine[0]): work
-            for work, mine in same.items()
-            if work not in done
-        }
-        try:
-            for future in as_completed(running):
-                work = running[future]
-                try:
-                    fresh = {"commit": source, **future.result()}
-                except Exception as error:  # the other cells are worth having all the same
-                    failures[same[work][0].name] = error
-                    continue
-                keep(work, fresh)
-        except BaseException:
-            executor.shutdown(wait=False, cancel_futures=True)
-            raise
+        kept = _ResultFolder(trials, folder, bar)
+        kept.keep_known_work()
+        failures = _run_missing(kept, executor)
     if failures:
         name, first = next(iter(failures.items()))
-        raise CellFailure(
-            f"{len(failures)} of {len(cells)} cells failed, first {name}: "
+        raise TrialFailure(
+            f"{len(failures)} of {kept.count} trials failed, first {name}: "
             f"{type(first).__name__}: {first}; the others are kept, so call it again"
         ) from first
-    return [result for cell in cells if (result := results[cell.name]) is not None]
+    return [kept.results[trial.name] for trial in kept.trials]
 
 
-def commit() -> str:
-    """The commit of the source tree, "+" if it differs from it; "unknown" outside a checkout."""
-    here = Path(__file__).parents[1]
-
-    def git(*words: str) -> str:
-        done = subprocess.run(
-            ["git", *words], cwd=here, capture_output=True, text=True, check=True, timeout=20
-        )
-        return done.stdout.strip()
-
+def _run_missing(kept: _ResultFolder, executor: Executor) -> dict[str, Exception]:
+    """Run what is missing; the errors of trials that failed, by the name of the trial."""
+    source = commit()  # now: the source tree may change while the trials run
+    failures: dict[str, Exception] = {}
+    running = {executor.submit(run_trial, same[0]): work for work, same in kept.missing.items()}
     try:
-        changed = git("status", "--porcelain", "--", ".")
-        return git("rev-parse", "--short=12", "HEAD") + ("+" if changed else "")
-    except (OSError, subprocess.SubprocessError):
-        return "unknown"
+        for future in as_completed(running):
+            work = running[future]
+            try:
+                result = {"commit": source, **future.result()}
+            except Exception as error:
+                failures[kept.missing[work][0].name] = error
+                continue
+            kept.keep(work, result)
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        raise
+    return failures

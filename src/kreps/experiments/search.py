@@ -1,10 +1,10 @@
-"""The parameter search that every compared method gets, on seeds that no figure uses.
+"""The parameter search of the compared methods, on seeds that no figure uses.
 
-Each method on each task has the same number of candidates, the first being its defaults where the
-task permits them.  Each is learnt on the same seeds; what counts is the evaluated
-reward of the policy, half with its exploration and half without, averaged over the last updates and
-the seeds.  (With exploration alone, value iteration would be chosen for exploring little, and be
-shown at far less than what its greedy policy can do.)
+Each method has the same number of candidates on each task.  The first candidate is the method's
+defaults, except where these need a grid that is too large for the task.  All candidates learn on
+the same seeds.  The score is the evaluated reward of the policy, half with its exploration and half
+without, averaged over the last updates and the seeds.  With exploration alone the search would
+choose value iteration with little exploration, whose greedy policy is far from its best.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from kreps.learning.storage import write_atomically
 SEEDS = (200, 201)
 ITERATIONS = 10
 COUNTED = 5
-"""Updates, from the last one back, over which the reward is averaged."""
+"""The score averages over so many of the latest updates."""
 
 EPISODES = 20
-"""Of each evaluation."""
+"""Rollouts of each evaluation."""
 
 _REPS: tuple[dict[str, Any], ...] = (
     {},
-    {"recipe": "paper"},
+    {"preset": "paper"},
     {"kl_bound": 0.7},
     {"ridge": 0.03},
     {"kl_bound": 0.7, "ridge": 0.03},
@@ -74,11 +74,11 @@ CANDIDATES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
         SAMPLE: _REPS,
         FEATURES: (
             {},
-            {"recipe": "paper"},
-            {"grid_size": 20},
+            {"preset": "paper"},
+            {"value.size": 20},
             {"ridge": 0.03},
-            {"grid_size": 7},
-            {"grid_size": 15},
+            {"value.size": 7},
+            {"value.size": 15},
         ),
         VALUES: _VALUE_ITERATION,
         GRID_VI: _grids((15, 7), (10, 7), (20, 5), (25, 5), (20, 9), (30, 3)),
@@ -91,7 +91,7 @@ CANDIDATES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
 
 
 def search_trials(task: str, method: str) -> list[list[Trial]]:
-    """The cells of each candidate."""
+    """The trials of each candidate: one list per candidate, one trial per seed."""
     return [
         [
             trial_of(
@@ -110,21 +110,21 @@ def search_trials(task: str, method: str) -> list[list[Trial]]:
 
 
 def score(rows: Sequence[Mapping[str, Any]]) -> float:
-    """The average of what counts over the rows of one cell."""
+    """The score of one trial from its rows, one per iteration."""
     counted = rows[-COUNTED:]
     return float(np.mean([[row["stochastic"], row["greedy"]] for row in counted]))
 
 
 def outcome(task: str, method: str, results: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """What the search of one method on one task found.
+    """The scores of all candidates of a method on a task, and the options of the best one.
 
     Args:
-        task, method: names.
-        results: of the cells, by their names.
+        task, method: keys of `CANDIDATES`.
+        results: of the trials, by their names.
     """
     scores = [
-        [round(score(results[cell.name]["rows"]), 4) for cell in cells]
-        for cells in search_trials(task, method)
+        [round(score(results[trial.name]["rows"]), 4) for trial in trials]
+        for trials in search_trials(task, method)
     ]
     best = int(np.argmax([np.mean(each) for each in scores]))
     candidates = CANDIDATES[task][method]
@@ -140,7 +140,17 @@ def outcome(task: str, method: str, results: Mapping[str, Mapping[str, Any]]) ->
 def write_search(
     path: Path, command: str, tasks: Sequence[str], results: Sequence[Mapping[str, Any]]
 ) -> Path:
-    """The outcome of the search on some tasks, beside what the file says of the others."""
+    """Write the outcome on some tasks; what the file holds of other tasks stays.
+
+    Args:
+        path: of the JSON file; a table is written beside it.
+        command: that made the results.
+        tasks: keys of `CANDIDATES`.
+        results: of all trials of these tasks.
+
+    Raises:
+        StorageError: the file is there but damaged, or cannot be written.
+    """
     by_name = {name_of(result): result for result in results}
     try:
         found = json.loads(path.read_text())["outcome"]
@@ -165,7 +175,7 @@ def write_search(
 
 
 def search_table(content: Mapping[str, Any]) -> str:
-    """The scores of all candidates as the documentation shows them, the chosen one in bold."""
+    """The documentation's table: scores of all candidates, the best in bold, and its options."""
     rows = []
     for task, methods in content["outcome"].items():
         for method, found in methods.items():
@@ -180,7 +190,7 @@ def search_table(content: Mapping[str, Any]) -> str:
 
 
 def tuned_options(task: str, method: str) -> dict[str, Any]:
-    """What the search chose for a method, by the committed file of its outcome."""
+    """The options of the best candidate, from the committed outcome; none if not `tuned`."""
     if not METHODS[method].tuned:
         return {}
     chosen = _committed_outcome()[task][method]["chosen"]
@@ -190,5 +200,5 @@ def tuned_options(task: str, method: str) -> dict[str, Any]:
 @cache
 def _committed_outcome() -> dict[str, Any]:
     file = resources.files("kreps.experiments").joinpath("search.json")
-    outcome: dict[str, Any] = json.loads(file.read_text())["outcome"]
-    return outcome
+    committed: dict[str, Any] = json.loads(file.read_text())["outcome"]
+    return committed

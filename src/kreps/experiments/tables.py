@@ -1,4 +1,4 @@
-"""Tables as the documentation shows them."""
+"""Markdown tables for the documentation."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ from collections.abc import Sequence
 
 
 def markdown(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table as Markdown."""
-    lines = [f"| {' | '.join(cells)} |" for cells in (headings, *rows)]
+    """A Markdown table of a heading and rows of as many columns."""
+    lines = [f"| {' | '.join(row)} |" for row in (headings, *rows)]
     return "\n".join([lines[0], "|---" * len(headings) + "|", *lines[1:]])

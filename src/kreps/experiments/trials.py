@@ -1,4 +1,4 @@
-"""One cell of an experiment: one method on one task with one seed, learnt and evaluated."""
+"""One trial of an experiment: one method on one task with one seed, learnt and evaluated."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ from kreps.settings import OnPolicySettings
 
 @dataclass(frozen=True)
 class Trial:
-    """What one worker is asked to do; made of plain values, so that it travels between processes.
+    """The work of one worker process, in plain values that can be sent between processes.
 
     Attributes:
-        task, method: names that are shown.
+        task, method: names that figures show.
         environment: Gymnasium name.
-        learner: a name of `kreps.learner.LEARNERS`.
-        options: of its constructor.
-        iterations, seed: as it takes them.
-        episodes: of the evaluations on the way, and of the last one.
-        label: tells apart cells of one method with other options.
+        learner: key of `kreps.learning.learner.LEARNERS`.
+        options: of the learner's constructor, plain JSON values.
+        iterations: policy updates.
+        seed: of the learner and of the evaluation.
+        episodes: evaluation rollouts after each update but the last, and after the last one.
+        label: distinguishes trials of one method with different options.
     """
 
     task: str
@@ -47,24 +48,25 @@ class Trial:
 
     @property
     def name(self) -> str:
+        """Path of the result file inside the folder of trials, without its ending."""
         return f"{_slug(self.task)}/{_slug(f'{self.method} {self.label} seed {self.seed}')}"
 
     def description(self) -> dict[str, Any]:
-        """As it is read back from a file."""
+        """All fields in the form that a JSON file returns them in."""
         plain: dict[str, Any] = json.loads(json.dumps({**vars(self), "options": {**self.options}}))
         return plain
 
     @property
     def work(self) -> str:
-        """What is to be done, whatever it is called: cells that agree in it have one result."""
+        """All fields except the displayed names: trials that agree in it have the same result."""
         names = ("task", "method", "label")
         work = {k: v for k, v in self.description().items() if k not in names}
         return json.dumps(work, sort_keys=True)
 
-    def named(self, result: Mapping[str, Any]) -> dict[str, Any]:
-        """The result of a cell of the same work as that of this one."""
+    def renamed(self, result: Mapping[str, Any]) -> dict[str, Any]:
+        """The result of a trial with the same work, under the names of this one."""
         rows = [{**row, "task": self.task, "method": self.method} for row in result["rows"]]
-        return {**result, "cell": self.description(), "rows": rows}
+        return {**result, "trial": self.description(), "rows": rows}
 
 
 def _slug(name: str) -> str:
@@ -81,7 +83,15 @@ def trial_of(
     episodes: tuple[int, int],
     label: str = "",
 ) -> Trial:
-    """The cell of a task, a method and a seed, with ``options`` beside the method's own."""
+    """The trial of a task, a method and a seed.
+
+    Args:
+        task_name, method_name: keys of `TASKS` and `METHODS`.
+        seed, episodes, label: see `Trial`.
+        options: replace those of the task and the method.
+        iterations: policy updates; None takes the number that the task prescribes.  A method with
+            ``once`` gets one.
+    """
     task, method = TASKS[task_name], METHODS[method_name]
     explores = issubclass(LEARNERS[method.learner].settings_type, OnPolicySettings)
     protocol = dict(task.exploration) if explores else {"ranges": task.ranges}
@@ -99,66 +109,75 @@ def trial_of(
     )
 
 
-def run_cell(cell: Trial) -> dict[str, Any]:
-    """Learn, and evaluate the policy after every iteration on random numbers of its own.
+def run_trial(trial: Trial) -> dict[str, Any]:
+    """Learn; after every iteration evaluate the policy on random numbers of its own.
 
     Returns:
-        The cell's description and one row per iteration.
+        ``trial``: its description; ``rows``: one per iteration.
     """
-    env = gym.make(cell.environment)
+    env = gym.make(trial.environment)
     rows: list[dict[str, Any]] = []
 
-    def evaluated(learner: Learner[Any], report: IterationReport) -> None:
+    def add_row(learner: Learner[Any], report: IterationReport) -> None:
         assert learner.state.policy is not None
         row: dict[str, Any] = {
-            "task": cell.task,
-            "method": cell.method,
-            "seed": cell.seed,
+            "task": trial.task,
+            "method": trial.method,
+            "seed": trial.seed,
             "iteration": report.iteration,
             "steps": report.steps,
             "training_reward": report.average_reward,
         }
         for name, policy in stochastic_and_greedy(learner.state.policy).items():
             with blas_threads(1):
-                found = evaluate(
+                evaluation = evaluate(
                     env,
                     learner.task,
                     policy,
                     restart_probability=learner.settings.restart_probability,
-                    episodes=cell.episodes[report.iteration == cell.iterations],
-                    seed=cell.seed,
+                    episodes=trial.episodes[report.iteration == trial.iterations],
+                    seed=trial.seed,
                 )
-            row[name] = found.mean
-            row[f"{name}_standard_error"] = found.standard_error
+            row[name] = evaluation.mean
+            row[f"{name}_standard_error"] = evaluation.standard_error
         stages = seconds_by_stage(report)
         row["rollout_cpu_seconds"] = stages.pop("rollouts")
         row["update_cpu_seconds"] = sum(stages.values())
         row["samples"] = report.update.samples
         rows.append({**row, **report.update.numbers()})
 
-    learner = LEARNERS[cell.learner](env, seed=cell.seed, **cell.options)
-    learner.learn(cell.iterations, callback=evaluated, progress=False)
-    return {"cell": cell.description(), "rows": rows}
+    learner = LEARNERS[trial.learner](env, seed=trial.seed, **trial.options)
+    learner.learn(trial.iterations, callback=add_row, progress=False)
+    return {"trial": trial.description(), "rows": rows}
 
 
-def read_cell(cell: Trial, folder: Path) -> dict[str, Any] | None:
-    """The result of this very cell if it is there and whole; None if it has to be run."""
-    path = folder / f"{cell.name}.json"
+def read_trial(trial: Trial, folder: Path) -> dict[str, Any] | None:
+    """The result in the folder; None if there is none, or one of other settings or iterations.
+
+    Raises:
+        StorageError: the file is damaged.
+    """
+    path = folder / f"{trial.name}.json"
     try:
-        found = json.loads(path.read_text())
-        same = found["cell"] == cell.description()
-        whole = len(found["rows"]) == cell.iterations and isinstance(found["commit"], str)
-        return found if same and whole else None
+        result = json.loads(path.read_text())
+        same = result["trial"] == trial.description()
+        complete = len(result["rows"]) == trial.iterations and isinstance(result["commit"], str)
+        return result if same and complete else None
     except FileNotFoundError:
         return None
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StorageError(
-            f"{path} is damaged ({error}); remove it to run the cell again"
+            f"{path} is damaged ({error}); remove it to run the trial again"
         ) from error
 
 
-def write_cell(cell: Trial, folder: Path, result: dict[str, Any]) -> None:
-    path = folder / f"{cell.name}.json"
+def write_trial(trial: Trial, folder: Path, result: dict[str, Any]) -> None:
+    """Write a result to the file that `read_trial` reads.
+
+    Raises:
+        StorageError: the folder cannot be made or the file not be written.
+    """
+    path = folder / f"{trial.name}.json"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -167,10 +186,10 @@ def write_cell(cell: Trial, folder: Path, result: dict[str, Any]) -> None:
 
 
 def name_of(result: Mapping[str, Any]) -> str:
-    """The name of the cell that a result is of."""
-    return Trial(**result["cell"]).name
+    """The name of the trial that a result belongs to."""
+    return Trial(**result["trial"]).name
 
 
 def commits_of(results: Sequence[Mapping[str, Any]]) -> str:
-    """The commits at which the cells were run: one, if all went well."""
+    """The different commits that the trials were run at, separated by commas."""
     return ", ".join(sorted({result["commit"] for result in results}))
