@@ -1,12 +1,22 @@
-"""The one place that translates names of earlier versions, as files of those versions hold them."""
+"""The one place that translates names of earlier versions, as files of those versions hold them.
+
+Settings are translated in the flat form of `kreps.presets`, files as arrays by name and a header.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from kreps.errors import StorageError
+
+# ---- presets and settings ---------------------------------------------------------------------
+
 PRESET_NAMES = {"default": "model_based", "observed": "single_step"}
-"""Presets (then "recipes") of version 0.1."""
+"""Presets (then "recipes") of version 0.1 that have another name now."""
 
 SETTING_NAMES = {
     "recipe": "preset",
@@ -29,9 +39,13 @@ SETTING_NAMES = {
 
 ANGLE_WRAPS = {"cut": "discontinuous", "round": "continuous"}
 
+RKHS_SETTINGS = {"max_rank", "basis_tolerance", "angles"}
+MODEL_BASED_SETTINGS = {"imagined_noise", "imagined_rollouts", "judging_rollouts", "optimism"}
+"""Settings of version 0.1 that had no effect without V in an RKHS, or with ``imagined=0``."""
+
 
 def present_name(name: str) -> str | None:
-    """What a setting of version 0.1 is called now; None if that is no such name."""
+    """What a setting of version 0.1 is called now; None if it is not such a name."""
     return SETTING_NAMES.get(name)
 
 
@@ -40,38 +54,39 @@ def present_preset(name: str) -> str:
     return PRESET_NAMES.get(name, name)
 
 
-def present_settings(given: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings, some or all of a learner's, in the flat form of `kreps.presets`.
+def present_settings(given: Mapping[str, Any], preset: str = "model_based") -> dict[str, Any]:
+    """Settings of version 0.1, some or all of a learner's, in the flat form of `kreps.presets`.
 
-    Settings of the present version are left as they are.  ``approximation`` ``"uniform"`` and
-    ``"fourier"`` are no more: pivoted Cholesky takes their place.
+    Settings that had no effect are left out: a setting of an absent section would add the section.
+    ``approximation`` ``"uniform"`` and ``"fourier"`` become pivoted Cholesky, which replaced them.
+    Names and values of the present version stay as they are.
+
+    Args:
+        given: changes of a preset, by name.
+        preset: the preset that they change, by its old or new name.
     """
     values = dict(given)
-    # "exploration" is a name of both versions: a section now, then the kind of noise
-    noise = values.pop("exploration", None)
-    if noise is not None:
-        values["exploration.noise"] = noise
     approximation = values.pop("approximation", "auto")
-    no_model_based = values.get("imagined") == 0
-    on_grid = values.get("features") == "grid"
-    new = {SETTING_NAMES.get(name, name): value for name, value in values.items()}
-    if "value.angle_wrap" in new:
+    features = values.pop("features", "rkhs")
+    imagined = values.pop("imagined", 4 if present_preset(preset) == "model_based" else 0)
+    unused = RKHS_SETTINGS if features == "grid" else {"grid_size"}
+    unused = unused | MODEL_BASED_SETTINGS if imagined == 0 else unused
+    new = {SETTING_NAMES.get(name, name): v for name, v in values.items() if name not in unused}
+    if isinstance(new.get("value.angle_wrap"), str):
         new["value.angle_wrap"] = ANGLE_WRAPS.get(new["value.angle_wrap"], new["value.angle_wrap"])
-    rkhs_only = {"value.max_rank", "value.tolerance", "value.angle_wrap"}
-    dropped = (
-        (rkhs_only if on_grid else {"value.size"})
-        if "features" in values or ("grid_size" in values)
-        else set()
-    )
+    if features != "rkhs":  # all presets have V in an RKHS
+        new["value"] = features
     if approximation == "exact":
         new["low_rank"] = None
-        dropped |= {"low_rank.rank"}
-    elif approximation != "auto":
+        new.pop("low_rank.rank", None)
+    elif approximation in ("pivoted", "uniform", "fourier"):
         new["low_rank.above"] = 0
-    if no_model_based:
-        dropped |= {name for name in new if name.startswith("model_based.")}
-        new["model_based"] = None
-    return {name: value for name, value in new.items() if name not in dropped}
+    elif approximation != "auto":
+        new["low_rank"] = approximation  # is refused
+    if "imagined" in given:
+        no_model = {"model_based": None}
+        new |= no_model if imagined == 0 else {"model_based.actions_per_state": imagined}
+    return new
 
 
 ADDED_IN_0_1 = {
@@ -88,11 +103,11 @@ ADDED_IN_0_1 = {
 
 
 def checkpoint_settings(stored: Mapping[str, Any], method: str) -> dict[str, Any]:
-    """All settings of a checkpoint, of this or an earlier version, in the flat form."""
-    if method != "reps" or "rollout_lengths" in stored:
-        return present_settings(stored)
-    return present_settings({**ADDED_IN_0_1, **stored})
+    """All settings of a checkpoint of version 0.1, in the flat form."""
+    return present_settings({**ADDED_IN_0_1, **stored} if method == "reps" else stored)
 
+
+# ---- progress.csv -----------------------------------------------------------------------------
 
 PROGRESS_COLUMNS = {
     "refused": "rejected",
@@ -105,3 +120,159 @@ PROGRESS_COLUMNS = {
 def present_columns(columns: Sequence[str]) -> tuple[str, ...]:
     """Columns of ``progress.csv``, of this or an earlier version, by their present names."""
     return tuple(PROGRESS_COLUMNS.get(name, name) for name in columns)
+
+
+# ---- files of arrays --------------------------------------------------------------------------
+
+FILE_VERSIONS = (1, 2)
+"""Versions of the file format that are translated.  Version 1 is version 2 with fewer settings."""
+
+Tensors = dict[str, NDArray[Any]]
+Header = dict[str, Any]
+
+PACKED = {
+    "policy.signal_and_noise": ("policy.signal", "policy.noise"),
+    "policy.offset_and_temperature": ("policy.offset", "policy.temperature"),
+    "policy.slope_and_noise": ("policy.slope", "policy.noise_fraction", "policy.noise_scale"),
+}
+"""Vectors of numbers that are stored one by one now."""
+
+ARRAY_NAMES = {
+    "policy.lengthscales": "policy.kernel.lengthscales",
+    "value.lengthscales": "value.kernel.lengthscales",
+    "value.cuts": "value.kernel.wraps",
+    "start.policy": "policy_start",
+    "start.embedding": "embedding_start",
+    "start.reward": "reward_start",
+}
+
+_POLICY = {"states", "targets", "weights", "mean_weights", "explained", "table", "candidates"}
+_POLICY_ARRAYS = {
+    "policy.lengthscales",
+    *PACKED,
+    *(f"policy.{name}" for name in {*_POLICY, "actions", "bounds"}),
+}
+_ROLLOUT_ARRAYS = {
+    f"window.{name}" for name in ("lengths", "terminated", "observations", "actions", "rewards")
+}
+_VALUE = {"centres", "alpha", "frequencies", "theta"}
+FILE_ARRAYS = {
+    "policy": _POLICY_ARRAYS,
+    "rollouts": _ROLLOUT_ARRAYS,
+    "checkpoint": {
+        *_POLICY_ARRAYS,
+        *_ROLLOUT_ARRAYS,
+        *ARRAY_NAMES,
+        *(f"value.{name}" for name in _VALUE),
+    },
+}
+"""All arrays of version 2, by kind of file."""
+
+NO_FOURIER_V = (
+    "its V is in random Fourier features, which are no longer supported, and is left out; "
+    "the policy is unchanged and the next update estimates V anew"
+)
+
+
+def present_file(kind: str, tensors: Tensors, header: Header) -> tuple[Tensors, Header]:
+    """Arrays and header of format version 1 or 2 as those of version 3.
+
+    Args:
+        kind: "policy", "rollouts" or "checkpoint".
+        tensors: float64 arrays by their old names.
+        header: as it was stored.
+
+    Raises:
+        StorageError, KeyError, TypeError, ValueError: something is missing, or makes no sense.
+            Shapes and values that are the same now are left to be checked as those of version 3.
+    """
+    named = header.get("arrays", sorted(tensors) if header["version"] == 1 else None)
+    if not isinstance(named, list):
+        raise StorageError("its header does not name its arrays")
+    missing = [name for name in named if name not in [*tensors]]
+    if missing:
+        raise StorageError(f"array {missing[0]!r:.60} is missing")
+    if len(named) != len(tensors):
+        raise StorageError("it holds arrays that its header does not name")
+    if kind == "rollouts":
+        new = _present_rollouts(tensors, "rollouts")
+        return new, {"steps": header.get("samples"), "rollouts": _tree(new, "rollouts")}
+    task = {"groups": [], "image_shape": None, **header["task"]}
+    if kind == "policy":
+        new = _present_arrays(tensors)
+        return new, {"task": task, "policy": _present_policy(new, header["policy"])}
+    return _present_checkpoint(tensors, {**header, "task": task})
+
+
+def _present_checkpoint(tensors: Tensors, header: Header) -> tuple[Tensors, Header]:
+    notes = []
+    if "value.frequencies" in tensors:
+        notes.append(NO_FOURIER_V)
+        # the reward model starts from its defaults, as its kernel was that of V
+        left_out = ("value.", "start.reward")
+        tensors = {n: v for n, v in tensors.items() if not n.startswith(left_out)}
+    method = header.get("method")
+    learnt = header["iteration"] != 0
+    new = _present_arrays(tensors)
+    new |= _present_rollouts(tensors, "window") if _ROLLOUT_ARRAYS & tensors.keys() else {}
+    has_value = learnt and method == "reps" and not notes
+    state = {
+        **{name: header[name] for name in ("iteration", "rollouts", "steps")},
+        "window": _tree(new, "window"),
+        "policy": _present_policy(new, header["policy"]) if learnt else None,
+        "value": (_tree(new, "value") or {}) if has_value else None,
+        **{f"{name}_start": _tree(new, f"{name}_start") for name in _STARTS},
+    }
+    settings = checkpoint_settings(header["settings"], str(method))
+    kept = {name: header[name] for name in ("task", "seed")}
+    return new, {**kept, "method": method, "settings": settings, "state": state, "notes": notes}
+
+
+_STARTS = ("embedding", "reward", "policy")
+
+
+def _present_policy(tensors: Tensors, kind: Any) -> Header:
+    return {"kind": kind, **(_tree(tensors, "policy") or {})}
+
+
+def _present_arrays(tensors: Tensors) -> Tensors:
+    """All arrays but those of rollouts by their present names."""
+    new: Tensors = {}
+    for name, values in tensors.items():
+        if name in PACKED:
+            if values.shape != (len(PACKED[name]),):
+                raise StorageError(f"array {name!r} has shape {values.shape}")
+            new |= {part: np.array(v) for part, v in zip(PACKED[name], values, strict=True)}
+        elif name not in _ROLLOUT_ARRAYS:
+            new[ARRAY_NAMES.get(name, name)] = values
+    for owner in ("policy", "value"):
+        if f"{owner}.kernel.lengthscales" in new:
+            new.setdefault(f"{owner}.kernel.wraps", np.zeros(0))
+    return new
+
+
+def _present_rollouts(tensors: Tensors, name: str) -> Tensors:
+    """The arrays of rollouts under a name, with offsets in place of lengths."""
+    lengths, ended, points, actions, rewards = (
+        tensors[f"window.{part}"]
+        for part in ("lengths", "terminated", "observations", "actions", "rewards")
+    )
+    n = len(np.atleast_1d(rewards))
+    whole = lengths.ndim == 1 and ((lengths >= 1) & (lengths <= n) & (lengths % 1 == 0)).all()
+    if not whole or lengths.sum() != n:
+        raise StorageError("the lengths of its rollouts do not fit their data")
+    return {
+        f"{name}.offsets": np.cumsum([0, *lengths.astype(np.int64)], dtype=np.int64),
+        f"{name}.terminated": ended != 0,
+        f"{name}.points": points,
+        f"{name}.actions": actions,
+        f"{name}.rewards": rewards,
+    }
+
+
+def _tree(tensors: Tensors, name: str) -> Any:
+    """What the header has of the arrays under a name: True for each, None if there are none."""
+    if name in tensors:
+        return True
+    parts = {n[len(name) + 1 :].split(".")[0] for n in tensors if n.startswith(f"{name}.")}
+    return {part: _tree(tensors, f"{name}.{part}") for part in sorted(parts)} or None

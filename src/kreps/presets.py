@@ -9,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from kreps.errors import ConfigurationError
-from kreps.legacy import present_name
+from kreps.legacy import present_name, present_preset, present_settings
 from kreps.settings import (
     RKHS,
     Exploration,
@@ -20,6 +20,7 @@ from kreps.settings import (
     LearnerSettings,
     LowRank,
     ModelBased,
+    Noise,
     Settings,
 )
 
@@ -47,13 +48,13 @@ temperature (``eta_floor=0`` takes it away).  ``"single_step"`` also makes one s
 that were taken, with the changes that were found to learn faster.  ``"model_based"``, the default,
 goes past the paper; docs/deviations.md has the changes and what they gain."""
 
-KINDS: dict[str, dict[str, type[Any]]] = {
-    "exploration": {"exploration": Exploration},
-    "value": {"rkhs": RKHS, "grid": Grid},
-    "low_rank": {"low_rank": LowRank},
-    "model_based": {"model_based": ModelBased},
+SECTIONS: dict[str, dict[str, Any]] = {
+    "exploration": {noise: Exploration(noise=noise) for noise in get_args(Noise)},
+    "value": {"rkhs": RKHS(), "grid": Grid()},
+    "low_rank": {"low_rank": LowRank()},
+    "model_based": {"model_based": ModelBased()},
 }
-"""Of each section, the first is the default."""
+"""The kinds of each section by name, with their defaults; the first one is the default."""
 
 
 def settings_of(preset: str | Settings = "model_based", /, **changes: Any) -> Settings:
@@ -65,8 +66,11 @@ def settings_of(preset: str | Settings = "model_based", /, **changes: Any) -> Se
     if isinstance(preset, str) and preset in PRESETS:
         preset = PRESETS[preset]
     if not isinstance(preset, Settings):
+        renamed = present_preset(preset) if isinstance(preset, str) else preset
+        hint = f" (it is called {renamed!r} now)" if renamed != preset else ""
         raise ConfigurationError(
-            f"preset {preset!r} is unknown; choose one of {', '.join(map(repr, PRESETS))}"
+            f"preset {preset!r:.60} is unknown{hint}; choose one of "
+            f"{', '.join(map(repr, PRESETS))}, or give a kreps.Settings"
         )
     return changed(preset, changes)
 
@@ -77,8 +81,9 @@ def changed(settings: AnySettings, changes: Mapping[str, Any]) -> AnySettings:
     Args:
         settings: of any learner.
         changes: new values by name, a whole section or one field of it (``"value.max_rank"``).  A
-            section may be given by the name of its kind (``"grid"``), with that kind's defaults;
-            a field of an absent section adds the section with its defaults.
+            section may be given by the name of its kind (``"grid"``, or ``"pink"`` for the noise of
+            ``exploration``), with the defaults of that kind, or as ``"none"``.  A field of an
+            absent section adds the section with its defaults.
 
     Raises:
         ConfigurationError: unknown parameter, or a value out of range.
@@ -87,13 +92,16 @@ def changed(settings: AnySettings, changes: Mapping[str, Any]) -> AnySettings:
     new: dict[str, Any] = {}
     for name, value in changes.items():
         if "." not in name:
+            if name not in known:
+                raise ConfigurationError(_unknown(name, value, list(flat(settings))))
             new[name] = _section_named(name, value)
     for name, value in changes.items():
-        section, _, part = name.partition(".")
-        if part and section in known and section in KINDS:
-            new[section] = _with_field(new.get(section, getattr(settings, section)), name, value)
-        elif section not in known or part:
-            raise ConfigurationError(_unknown(name, list(flat(settings))))
+        section, dot, part = name.partition(".")
+        if not dot:
+            continue
+        if section not in known or section not in SECTIONS:
+            raise ConfigurationError(_unknown(name, value, list(flat(settings))))
+        new[section] = _with_field(new.get(section, getattr(settings, section)), name, part, value)
     return replace(settings, **new)
 
 
@@ -105,8 +113,8 @@ def flat(settings: LearnerSettings) -> dict[str, Any]:
         if not is_dataclass(value):
             values[each.name] = value
             continue
-        if len(KINDS[each.name]) > 1:
-            kinds = {kind: name for name, kind in KINDS[each.name].items()}
+        kinds = {type(default): kind for kind, default in SECTIONS[each.name].items()}
+        if len(kinds) > 1:
             values[each.name] = kinds[type(value)]
         for part in fields(value):
             values[f"{each.name}.{part.name}"] = getattr(value, part.name)
@@ -115,25 +123,46 @@ def flat(settings: LearnerSettings) -> dict[str, Any]:
 
 def _section_named(name: str, value: Any) -> Any:
     """A section by the name of its kind; any other value as it is."""
-    if name in KINDS and isinstance(value, str):
-        if value.lower() == "none":
-            return None
-        if value in KINDS[name]:
-            return KINDS[name][value]()
-    return value
+    if name not in SECTIONS or not isinstance(value, str):
+        return value
+    kinds = SECTIONS[name]
+    if value.lower() == "none":
+        return None
+    if value not in kinds:
+        owners = dict.fromkeys(f"kreps.{type(kind).__name__}(...)" for kind in kinds.values())
+        raise ConfigurationError(
+            f"{name} = {value!r:.60} is unknown; choose one of {', '.join(map(repr, kinds))}, or "
+            f"give {' or '.join(owners)}"
+        )
+    return kinds[value]
 
 
-def _with_field(section: Any, name: str, value: Any) -> Any:
-    of, part = name.split(".", 1)
+def _with_field(section: Any, name: str, part: str, value: Any) -> Any:
+    """A section with one field changed; None stands for the default kind of the section."""
+    owner = name.partition(".")[0]
     if section is None:
-        section = next(iter(KINDS[of].values()))()
+        section = next(iter(SECTIONS[owner].values()))
     names = [each.name for each in fields(section)] if is_dataclass(section) else []
     if part not in names:
-        raise ConfigurationError(_unknown(name, [f"{of}.{each}" for each in names]))
+        raise ConfigurationError(_unknown(name, value, [f"{owner}.{each}" for each in names]))
     return replace(section, **{part: value})
 
 
-def _unknown(name: str, known: list[str]) -> str:
+def _unknown(name: str, value: Any, known: list[str]) -> str:
+    """The message about an unknown parameter, with its present name if it is one of version 0.1."""
+    return f"unknown parameter {name}{_hint(name, value)}; the parameters are {', '.join(known)}"
+
+
+def _hint(name: str, value: Any) -> str:
     renamed = present_name(name)
-    hint = f" (it is called {renamed} now)" if renamed else ""
-    return f"unknown parameter {name}{hint}; the parameters are {', '.join(known)}"
+    if renamed is None:
+        return ""
+    if name == "recipe":
+        preset = present_preset(value) if isinstance(value, str) else value
+        return f" (it is called preset now: write preset={preset!r:.40})"
+    translated = present_settings({name: value}) or {renamed: value}
+    written = ", ".join(
+        f'**{{"{new}": {v!r:.40}}}' if "." in new else f"{new}={v!r:.40}"
+        for new, v in translated.items()
+    )
+    return f" (it is called {renamed} now: write {written})"
