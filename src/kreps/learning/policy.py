@@ -12,7 +12,7 @@ from kreps.data.task import LARGEST, is_sane
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import FloatArray
 from kreps.learning import storage
-from kreps.learning.onnx import write_onnx
+from kreps.learning.storage.onnx import write_onnx
 from kreps.policies.base import LearntPolicy
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 from kreps.policies.sparse_gp import SparseGP

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Factor, Periodic, SmoothedImage, SquaredExponential, smoothing
-from kreps.learning.storage import write_atomically
+from kreps.learning.storage.files import write_atomically
 from kreps.policies.sparse_gp import SparseGP
 
 OPSET, IR_VERSION = 17, 8

@@ -1,0 +1,30 @@
+"""Policies, rollouts and checkpoints as files."""
+
+from kreps.learning.storage.checkpoints import (
+    POLICIES_OF_METHOD,
+    load_checkpoint,
+    save_checkpoint,
+)
+from kreps.learning.storage.files import MAX_FILE_BYTES, VERSION, write_atomically
+from kreps.learning.storage.policies import load_policy, save_policy
+from kreps.learning.storage.rollouts import (
+    RolloutFile,
+    load_rollouts,
+    rollout_folder,
+    save_rollouts,
+)
+
+__all__ = [
+    "MAX_FILE_BYTES",
+    "POLICIES_OF_METHOD",
+    "VERSION",
+    "RolloutFile",
+    "load_checkpoint",
+    "load_policy",
+    "load_rollouts",
+    "rollout_folder",
+    "save_checkpoint",
+    "save_policy",
+    "save_rollouts",
+    "write_atomically",
+]

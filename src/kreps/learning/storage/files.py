@@ -1,0 +1,171 @@
+"""Files of named arrays (safetensors) with one JSON header, written atomically and read warily.
+
+Before any array is read, a file is checked for its size, kind, version and names, and for types and
+shapes of its arrays.  Whatever is wrong with it is raised as `StorageError`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import safetensors
+import safetensors.numpy
+
+from kreps import legacy
+from kreps.errors import KrepsError, StorageError
+from kreps.learning.storage.codec import StoredArrays, Tensors, check_sane
+
+VERSION = 3
+MAX_FILE_BYTES = 2**30
+MAX_HEADER_BYTES = 2**22
+
+Header = dict[str, Any]
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace a file as a whole: at any moment, also if the process is killed, it is old or new.
+
+    Raises:
+        StorageError: the folder does not exist, or cannot be written to.
+    """
+    if not path.name or "\0" in str(path):
+        raise StorageError(f"{str(path)!r} does not name a file")
+    part = path.with_name(f".{path.name}.part")
+    try:
+        with open(part, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            part.unlink()
+        raise StorageError(
+            f"cannot write {path}: {error}; check the folder and its space"
+        ) from error
+
+
+def write_arrays(
+    path: Path, kind: str, tensors: Tensors, header: Header, max_bytes: int = MAX_FILE_BYTES
+) -> None:
+    """Write arrays and a JSON header.  The same content gives the same bytes.
+
+    Args:
+        path: the file to replace.
+        kind: "policy", "rollouts" or "checkpoint".
+        tensors: arrays by name.
+        header: anything that JSON can hold, beside the kind and version of the file.
+        max_bytes: largest size of the file, as when it is read.
+
+    Raises:
+        StorageError: the file cannot be written, or would be too large to be read.
+    """
+    text = json.dumps({"kind": kind, "version": VERSION, **header}, sort_keys=True)
+    limit = MAX_HEADER_BYTES // 2  # quoting in the file may double it
+    if len(text) > limit:
+        raise StorageError(
+            f"the header of {path} would have {len(text)} bytes, the limit is {limit}; observe "
+            "with fewer coordinates, such as smaller images"
+        )
+    arrays = {name: tensors[name] for name in sorted(tensors)}
+    content = safetensors.numpy.save(arrays, metadata={"kreps": text})
+    if len(content) > max_bytes:
+        raise StorageError(
+            f"{path} would have {len(content)} bytes, the limit is {max_bytes}; keep fewer "
+            "rollouts by a smaller window, or observe with fewer coordinates"
+        )
+    write_atomically(path, content)
+
+
+@contextmanager
+def reading(
+    path: str | Path, kind: str, max_bytes: int = MAX_FILE_BYTES
+) -> Iterator[tuple[StoredArrays, Header]]:
+    """The arrays and the header of an open file, in the names of the present version.
+
+    Arrays must be read before the block ends.  Errors of the block are those of the file.
+
+    Raises:
+        StorageError: missing, unreadable, damaged, too large, or of another kind or version.
+    """
+    path = Path(path)
+    try:
+        if not path.is_file():
+            raise StorageError(f"{path} is not a file; check the path")
+        _check_size(path, max_bytes)
+        with safetensors.safe_open(path, framework="numpy") as file:
+            header = _header(file.metadata(), kind)
+            layout = {
+                name: (part.get_dtype(), tuple(part.get_shape()))
+                for name in list(file.keys())
+                for part in (file.get_slice(name),)
+            }
+            arrays = StoredArrays(layout, lambda name: np.asarray(file.get_tensor(name)))
+            if header["version"] in legacy.FILE_VERSIONS:
+                arrays, header = _present(kind, arrays, header)
+            yield arrays, header
+    except KrepsError as error:
+        raise StorageError(f"cannot read {path} as a kreps {kind}: {error}") from error
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        KeyError,
+        OverflowError,
+        MemoryError,
+        RecursionError,
+        safetensors.SafetensorError,
+    ) as error:
+        raise StorageError(
+            f"cannot read {path} as a kreps {kind}: {type(error).__name__}: {error}; "
+            "the file is damaged or comes from another program"
+        ) from error
+
+
+def _check_size(path: Path, max_bytes: int) -> None:
+    """Limit what parsing the file may allocate, before it is parsed."""
+    size = path.stat().st_size
+    if size > max_bytes:
+        raise StorageError(f"it has {size} bytes, the limit is {max_bytes}")
+    with open(path, "rb") as file:
+        length = int.from_bytes(file.read(8), "little")
+    if size < 8 or length > min(MAX_HEADER_BYTES, size - 8):
+        raise StorageError(
+            f"its header would have {length} bytes, the limit is {MAX_HEADER_BYTES} "
+            f"in a file of {size}; it is damaged or not a safetensors file"
+        )
+
+
+def _header(metadata: dict[str, str] | None, kind: str) -> Header:
+    header = json.loads((metadata or {}).get("kreps", "null"))
+    if not isinstance(header, dict) or "kind" not in header:
+        raise StorageError("it has no kreps header: it comes from another program")
+    if header["kind"] != kind:
+        raise StorageError(f"it is a kreps {header['kind']!s:.40}")
+    version = header.get("version")
+    if type(version) is not int or version not in (VERSION, *legacy.FILE_VERSIONS):
+        raise StorageError(
+            f"it has format version {version!s:.20}, this release reads 1 to {VERSION}; "
+            "read it with the release that wrote it"
+        )
+    return header
+
+
+def _present(kind: str, arrays: StoredArrays, header: Header) -> tuple[StoredArrays, Header]:
+    """Arrays and header of an earlier version in the names of the present one."""
+    for name, (dtype, _) in arrays.layout.items():
+        if name not in legacy.FILE_ARRAYS[kind]:
+            raise StorageError(f"a {kind} has no array {name!r:.60}")
+        if dtype != "F64":
+            raise StorageError(f"array {name!r} has numbers of type {dtype!s:.20}, not F64")
+    tensors = {name: arrays.load(name) for name in arrays.layout}
+    for name, values in tensors.items():
+        check_sane(name, values)
+    tensors, header = legacy.present_file(kind, tensors, header)
+    return StoredArrays.from_memory(tensors), header

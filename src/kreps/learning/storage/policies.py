@@ -1,0 +1,197 @@
+"""Policies as files: the task they act in, and one of four kinds of policy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from kreps.data.task import TaskSpec
+from kreps.errors import StorageError
+from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import Kernel, WrapAngle, wrap_factors
+from kreps.kernels.threads import blas_threads
+from kreps.learning.storage.codec import (
+    FRACTION,
+    NOT_NEGATIVE,
+    POSITIVE,
+    Array,
+    Converted,
+    Limit,
+    Node,
+    Number,
+    OneOf,
+    Plain,
+    Record,
+    StoredArrays,
+    Tensors,
+)
+from kreps.learning.storage.files import MAX_FILE_BYTES, reading, write_arrays
+from kreps.policies.base import LearntPolicy
+from kreps.policies.cost_sensitive_gp import MAX_SUPPORT, CostSensitiveGP
+from kreps.policies.sparse_gp import SparseGP
+from kreps.policies.value_based import LipschitzPolicy, SoftmaxPolicy
+
+TASK = Record(
+    TaskSpec,
+    {
+        "observation_size": Plain(),
+        "action_low": Plain(),
+        "action_high": Plain(),
+        "periodic": Plain(),
+        "groups": Plain(),
+        "image_shape": Plain(),
+    },
+)
+
+LENGTHSCALES = Limit("between 1e-50 and 1e50", lambda v: (v > 1e-50) & (v < 1e50))
+TEMPERATURE = Limit("0 or above 1e-50", lambda v: (v == 0) | (v > 1e-50))
+
+
+@dataclass(frozen=True)
+class StoredKernel:
+    """A kernel over states; the task decides its factors, except those of wrapping angles.
+
+    Attributes:
+        lengthscales: (g + w,) of the factors of the task, then of those of wrapping angles.
+        wraps: (w,) where each angle wraps, in rad; w is 0 or the number of angles of the task.
+    """
+
+    lengthscales: FloatArray
+    wraps: FloatArray
+
+
+def _stored_kernel(kernel: Kernel) -> StoredKernel:
+    wraps = [factor.begin for factor in kernel.factors if isinstance(factor, WrapAngle)]
+    return StoredKernel(kernel.lengthscales, np.array(wraps, dtype=np.float64))
+
+
+def _kernel(stored: StoredKernel, given: Mapping[str, Any]) -> Kernel:
+    task: TaskSpec = given["task"]
+    wraps = stored.wraps.tolist()
+    if len(wraps) not in (0, len(task.periodic)):
+        raise StorageError(
+            f"a kernel has wraps of {len(wraps)} angles, but the task has {len(task.periodic)}"
+        )
+    factors = wrap_factors(task.periodic[: len(wraps)], wraps)
+    return Kernel((*task.state_factors, *factors), stored.lengthscales)
+
+
+def kernel_schema(wraps: str | int) -> Converted:
+    """A kernel over states with so many wrapping angles: a number, or a letter for any."""
+    lengthscales = f"g+{wraps}" if wraps else "g"
+    return Converted(
+        Record(
+            StoredKernel,
+            {"wraps": Array((wraps,)), "lengthscales": Array((lengthscales,), LENGTHSCALES)},
+        ),
+        _stored_kernel,
+        _kernel,
+    )
+
+
+SUPPORT = {"m": (1, MAX_SUPPORT)}
+KERNEL_AND_STATES: dict[str, Node] = {
+    "kernel": kernel_schema(wraps=0),
+    "states": Array(("m", "ds")),
+}
+
+POLICY = OneOf(
+    {
+        "cost-sensitive-gp": Record(
+            CostSensitiveGP,
+            {
+                **KERNEL_AND_STATES,
+                "targets": Array(("m", "da")),
+                "weights": Array(("m",), POSITIVE),
+                "signal": Number(POSITIVE),
+                "noise": Number(POSITIVE),
+            },
+            given=("task",),
+            ranges=SUPPORT,
+        ),
+        "sparse-gp": Record(
+            SparseGP,
+            {
+                **KERNEL_AND_STATES,
+                "mean_weights": Array(("m", "da")),
+                "explained": Array(("m", "m")),
+                "signal": Number(POSITIVE),
+                "noise": Number(POSITIVE),
+            },
+            given=("task",),
+            ranges=SUPPORT,
+        ),
+        "softmax": Record(
+            SoftmaxPolicy,
+            {
+                **KERNEL_AND_STATES,
+                "table": Array(("m", "k")),
+                "candidates": Array(("k", "da")),
+                "offset": Number(),
+                "temperature": Number(TEMPERATURE),
+            },
+            given=("task",),
+            ranges={**SUPPORT, "k": (1, MAX_SUPPORT)},
+        ),
+        "lipschitz": Record(
+            LipschitzPolicy,
+            {
+                **KERNEL_AND_STATES,
+                "actions": Array(("m", "da")),
+                "bounds": Array(("m",)),
+                "slope": Number(NOT_NEGATIVE),
+                "noise_fraction": Number(FRACTION),
+                "noise_scale": Number(NOT_NEGATIVE),
+            },
+            given=("task",),
+            ranges=SUPPORT,
+        ),
+    }
+)
+"""Kinds of policies by their names in files.  Sizes: m support points, ds and da coordinates of
+states and actions, g factors of the kernel, k candidate actions."""
+
+
+def decode_task(header: Mapping[str, Any]) -> TaskSpec:
+    """The task that a header holds; its constructor checks it."""
+    task: TaskSpec
+    (task,) = StoredArrays.from_memory({}).decode([("task", TASK, header["task"])], {})
+    return task
+
+
+def task_sizes(task: TaskSpec) -> dict[str, int]:
+    """The sizes that the task decides."""
+    return {"g": task.factor_count, "ds": task.observation_size, "da": task.action_size}
+
+
+def save_policy(policy: LearntPolicy, path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> None:
+    """Write a policy to a file of at most ``max_bytes``.
+
+    Raises:
+        StorageError: another kind of policy, or the file cannot be written.
+    """
+    tensors: Tensors = {}
+    header = {
+        "task": TASK.encode(policy.task, "task", tensors),
+        "policy": POLICY.encode(policy, "policy", tensors),
+    }
+    write_arrays(Path(path), "policy", tensors, header, max_bytes)
+
+
+def load_policy(path: str | Path) -> LearntPolicy:
+    """A policy written by `save_policy`, of this or an earlier version.
+
+    Raises:
+        StorageError: the file is missing, damaged or foreign.
+    """
+    # with one thread, as in learning, so that the policy is the same to the last bit
+    with reading(path, "policy") as (arrays, header), blas_threads(1):
+        task = decode_task(header)
+        policy: LearntPolicy
+        nodes = [("policy", POLICY, header["policy"])]
+        (policy,) = arrays.decode(nodes, {"task": task}, **task_sizes(task))
+    return policy
