@@ -12,7 +12,7 @@ from kreps.algorithms.reps import PolicyTargets, policy_hyperparameters, value_b
 from kreps.kernels.hyperparameters import EmbeddingLoss, PolicyLoss, factor_distances
 from kreps.kernels.kernel import Kernel, SquaredExponential, median_lengthscales
 from kreps.kernels.regression import KernelEmbedding
-from kreps.kernels.sampling import FIT_SAMPLE
+from kreps.kernels.sampling import FIT_SAMPLE_SIZE
 from kreps.models.transition import fit_embedding, state_kernel, successor_features
 
 N = 1500
@@ -51,22 +51,22 @@ def bench_embedding(measure: Measure) -> None:
 
 def bench_embedding_loss(measure: Measure) -> None:
     p = Prepared()
-    rows = slice(0, FIT_SAMPLE)
+    rows = slice(0, FIT_SAMPLE_SIZE)
     rank = p.changes.shape[1]
     distances = factor_distances(p.input_kernel.factors, p.inputs[rows])
-    loss = EmbeddingLoss(distances, p.changes[rows], np.ones(FIT_SAMPLE))
+    loss = EmbeddingLoss(distances, p.changes[rows], np.ones(FIT_SAMPLE_SIZE))
     x = np.append(np.log(p.input_kernel.lengthscales), np.log(1e-3))
     measure(
         "loss of the embedding, with gradient",
-        f"{FIT_SAMPLE} samples, {rank} features",
+        f"{FIT_SAMPLE_SIZE} samples, {rank} features",
         lambda: loss(x),
-        Share(flops.embedding_loss(FIT_SAMPLE, rank)),
+        Share(flops.embedding_loss(FIT_SAMPLE_SIZE, rank)),
     )
 
 
 def bench_policy_loss(measure: Measure) -> None:
     p = Prepared()
-    rows = slice(0, FIT_SAMPLE)
+    rows = slice(0, FIT_SAMPLE_SIZE)
     loss = PolicyLoss(
         factor_distances(p.kernel.factors, p.samples.states[rows]),
         p.samples.targets[rows],
@@ -75,9 +75,9 @@ def bench_policy_loss(measure: Measure) -> None:
     x = np.append(np.log(p.kernel.lengthscales), np.log([1.0, 0.3]))
     measure(
         "loss of the policy, with gradient",
-        f"{FIT_SAMPLE} samples",
+        f"{FIT_SAMPLE_SIZE} samples",
         lambda: loss(x),
-        Share(flops.policy_loss(FIT_SAMPLE)),
+        Share(flops.policy_loss(FIT_SAMPLE_SIZE)),
     )
 
 
@@ -85,7 +85,7 @@ def bench_embedding_fit(measure: Measure) -> None:
     p = Prepared()
     measure(
         "fit of the embedding, cold start",
-        f"n = {N}, of which {FIT_SAMPLE} searched",
+        f"n = {N}, of which {FIT_SAMPLE_SIZE} searched",
         lambda: fit_embedding(p.transitions, p.changes, p.kernel, p.task, None, RNG(3)),
         Seconds(),
     )
@@ -95,7 +95,7 @@ def bench_policy_fit(measure: Measure) -> None:
     p = Prepared()
     measure(
         "hyper-parameters of the policy, cold start",
-        f"n = {N}, of which {FIT_SAMPLE} searched",
+        f"n = {N}, of which {FIT_SAMPLE_SIZE} searched",
         lambda: policy_hyperparameters(p.samples, p.kernel, p.settings, None, RNG(3)),
         Seconds(),
     )

@@ -1,9 +1,9 @@
-"""Low rank against exact, and how its cost grows: pictures and numbers for docs/performance.md.
+"""Low rank against exact, and how its cost grows: figures and numbers for docs/performance.md.
 
 python benchmarks/low_rank.py accuracy    # error of one update against the exact one, by rank
-python benchmarks/low_rank.py variance    # what each policy says far from its data
+python benchmarks/low_rank.py variance    # standard deviations of policies far from the data
 python benchmarks/low_rank.py scale       # CPU time and memory for 10^4 to 10^6 samples
-    python benchmarks/low_rank.py growth      # CPU time by rank, and by the size of observations
+python benchmarks/low_rank.py growth      # CPU time by rank, and by the size of observations
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from kreps.data.compute import CHUNK_SIZE
 from kreps.data.task import TaskSpec
 from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
-from kreps.kernels.basis import FourierBasis, RKHSBasis
+from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.kernel import Kernel, factors_of
 from kreps.kernels.threads import blas_threads
 from kreps.learning.collect import simulate
@@ -43,7 +43,6 @@ from kreps.policies.sparse_gp import PolicySums, SparseGP
 TASK = "kreps/SwingUp-v0"
 SEEDS = range(110, 115)  # not those of any reported result
 RANKS = (25, 50, 100, 200, 400, 800)
-WAYS = {"pivoted": BLUE, "uniform": ORANGE, "fourier": "#3a923a"}
 SIZES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 
 
@@ -62,18 +61,20 @@ def write(out: Path, name: str, content: dict[str, Any], figure: Figure, table: 
 # ---- accuracy ---------------------------------------------------------------------------------
 
 
-def errors(seed: int) -> dict[str, dict[int, tuple[float, float, float]]]:
-    """Of weights, V and policy, by way and rank, at the ninth update of a learner."""
+def errors(seed: int) -> dict[int, tuple[float, float, float]]:
+    """Of weights, V and policy, by rank, at the ninth update of a learner."""
     env = gym.make(TASK)
-    learner = kreps.KREPS(env, seed=seed, recipe="observed")  # one step, same samples for all
+    learner = kreps.KREPS(env, seed=seed, preset="single_step")  # the same samples for all ranks
     learner.learn(8, progress=False)
     state, fresh = learner.state, learner._collect(learner.env, None)
     states = np.concatenate([rollout.observations for rollout in fresh])
 
-    def updated(approximation: str, rank: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def updated(
+        low_rank: kreps.LowRank | None, max_rank: int
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         learner.state = state
         learner.settings = replace(
-            learner.settings, approximation=approximation, rank=rank, max_rank=rank
+            learner.settings, low_rank=low_rank, value=kreps.RKHS(max_rank=max_rank)
         )
         info = learner.update(fresh)
         policy = learner.state.policy
@@ -81,53 +82,51 @@ def errors(seed: int) -> dict[str, dict[int, tuple[float, float, float]]]:
         value = learner.value_function(states)
         return info.dual.weights, value - value.mean(), policy.greedy(states)
 
-    exact = updated("exact", 400)
-    found: dict[str, dict[int, tuple[float, float, float]]] = {}
-    for way in WAYS:
-        for rank in RANKS:
-            weights, value, actions = updated(way, rank)
-            found.setdefault(way, {})[rank] = (
-                float(np.abs(weights - exact[0]).sum() / 2.0),
-                float((value - exact[1]).std() / exact[1].std()),
-                float(np.sqrt(np.mean((actions - exact[2]) ** 2)) / learner.task.action_scale[0]),
-            )
+    exact = updated(None, 400)
+    found: dict[int, tuple[float, float, float]] = {}
+    for rank in RANKS:
+        weights, value, actions = updated(kreps.LowRank(rank=rank, above=0), rank)
+        found[rank] = (
+            float(np.abs(weights - exact[0]).sum() / 2.0),
+            float((value - exact[1]).std() / exact[1].std()),
+            float(np.sqrt(np.mean((actions - exact[2]) ** 2)) / learner.task.action_scale[0]),
+        )
     return found
 
 
 def accuracy(out: Path) -> None:
     with blas_threads(1):
         by_seed = [errors(seed) for seed in SEEDS]
-    names = ("weights (total variation)", "V (share of its spread)", "mean action (of half range)")
+    names = (
+        "weights (total variation)",
+        "V (share of its deviation)",
+        "mean action (of half range)",
+    )
     with rc_context(STYLE):
         figure = Figure(figsize=(9.0, 3.2), layout="constrained")
         axes = figure.subplots(1, 3, sharex=True)
         for i, (axis, name) in enumerate(zip(axes, names, strict=True)):
-            for way, colour in WAYS.items():
-                values = np.array([[seed[way][rank][i] for rank in RANKS] for seed in by_seed])
-                axis.loglog(RANKS, np.maximum(values.T, 1e-6), color=colour, lw=0.6, alpha=0.4)
-                middle = np.maximum(np.median(values, axis=0), 1e-6)
-                axis.loglog(RANKS, middle, "o-", color=colour, ms=3, label=way)
+            values = np.array([[seed[rank][i] for rank in RANKS] for seed in by_seed])
+            axis.loglog(RANKS, np.maximum(values.T, 1e-6), color=BLUE, lw=0.6, alpha=0.4)
+            axis.loglog(RANKS, np.maximum(np.median(values, axis=0), 1e-6), "o-", color=BLUE, ms=3)
             axis.set_title(name, fontsize=9)
             axis.set_xlabel("rank of every basis")
             axis.set_xticks(RANKS, [str(rank) for rank in RANKS])
             axis.minorticks_off()
         axes[0].set_ylabel("distance from the exact update")
-        axes[0].legend(frameon=False)
     rows = [
-        [way, str(rank)]
-        + [f"{np.median([seed[way][rank][i] for seed in by_seed]):.1e}" for i in range(3)]
-        for way in WAYS
+        [str(rank)] + [f"{np.median([seed[rank][i] for seed in by_seed]):.1e}" for i in range(3)]
         for rank in RANKS
     ]
     content = {"seeds": list(SEEDS), "errors": by_seed}
-    write(out, "accuracy", content, figure, markdown(["basis", "rank", *names], rows))
+    write(out, "accuracy", content, figure, markdown(["rank", *names], rows))
 
 
 # ---- variance ---------------------------------------------------------------------------------
 
 
 def variance(out: Path) -> None:
-    """Samples on the left, nothing on the right."""
+    """Standard deviations over states, with samples only at negative ones."""
     rng = np.random.default_rng(0)
     task = TaskSpec(1, np.array([-1.0]), np.array([1.0]))
     kernel = Kernel(factors_of(1), np.array([0.3]))
@@ -137,22 +136,22 @@ def variance(out: Path) -> None:
     exact = CostSensitiveGP(task, kernel, states, targets, weights, signal, noise)
     x = np.linspace(-2.5, 2.5, 501)[:, None]
 
-    def regressors(basis: RKHSBasis | FourierBasis) -> np.ndarray:
+    def regressors(basis: RKHSBasis) -> np.ndarray:
         """Subset of regressors: only the part of the variance that the features can express."""
-        sums = PolicySums.of(basis.features(states), weights, targets)
+        sums = PolicySums.from_samples(basis.features(states), weights, targets)
         z = basis.features(x)
         p = np.eye(z.shape[1]) + signal / noise * sums.precision
         explained = signal * np.einsum("ij,ij->i", z, np.linalg.solve(p, z.T).T)
         return np.sqrt(explained + noise)[:, None]
 
     pivoted, features = RKHSBasis.fit(kernel, states, tolerance=1e-6, max_rank=20)
-    ours = SparseGP.fit(task, pivoted, PolicySums.of(features, weights, targets), signal, noise)
-    fourier = FourierBasis.draw(kernel, 1, max_rank=20, rng=rng)
+    ours = SparseGP.fit(
+        task, pivoted, PolicySums.from_samples(features, weights, targets), signal, noise
+    )
     curves: dict[str, tuple[np.ndarray, str, str]] = {
         "exact": (exact.standard_deviation(x), GREY, "-"),
         "20 centres, projected process (kreps)": (ours.standard_deviation(x), BLUE, "--"),
         "20 centres, subset of regressors": (regressors(pivoted), ORANGE, "-"),
-        "20 Fourier features": (regressors(fourier), "#3a923a", "-"),
     }
     with rc_context(STYLE):
         figure = Figure(figsize=(6.4, 3.2), layout="constrained")
@@ -175,7 +174,7 @@ def variance(out: Path) -> None:
 
 
 def make_data(folder: Path, n: int, steps: int = 50) -> None:
-    """n steps of the first policy, laid end to end."""
+    """Arrays of n steps of the first policy, rollout after rollout."""
     env = gym.make(TASK)
     task = kreps.KREPS(env).task
     policy, count, at_once = BangBang(task), n // steps, 2000
@@ -199,7 +198,7 @@ def peak_memory() -> float:
 
 
 def one_size(folder: Path, n: int, options: dict[str, Any], steps: int = 50) -> dict[str, Any]:
-    """CPU seconds by stage and peak memory of one update; in a process of its own."""
+    """CPU seconds by stage and peak memory of one update; run it in a process of its own."""
     count = n // steps
     maps = [
         np.load(folder / f"{name}.npy", mmap_mode="r")
@@ -226,8 +225,6 @@ def one_size(folder: Path, n: int, options: dict[str, Any], steps: int = 50) -> 
 
 VARIANTS: dict[str, tuple[dict[str, Any], tuple[int, ...]]] = {
     "defaults (rank 1000, V up to 400)": ({}, SIZES),
-    # pivots stop when a basis is complete; random ones do not
-    "every rank 1000": ({"approximation": "uniform", "max_rank": 1000}, SIZES[::2]),
 }
 
 
@@ -258,7 +255,7 @@ def scale(out: Path, largest: int) -> None:
     with rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.2), layout="constrained")
         left, right = figure.subplots(1, 2)
-        for (variant, rows), colour in zip(found.items(), (BLUE, ORANGE), strict=True):
+        for (variant, rows), colour in zip(found.items(), (BLUE,), strict=True):
             x = [row["samples"] for row in rows]
             y = [row["cpu_seconds"] for row in rows]
             large = [i for i, n in enumerate(x) if n >= 30_000]
@@ -298,7 +295,7 @@ BASES = (100, 200, 400, 800, 1600)
 
 
 def walks(dimension: int, n: int = 20_000, steps: int = 50) -> list[kreps.Rollout]:
-    """Random walks pushed by one action, paid for staying near zero."""
+    """Random walks pushed by one action, with rewards for staying near zero."""
     rng = np.random.default_rng(dimension)
     found = []
     for _ in range(n // steps):
@@ -315,11 +312,10 @@ def seconds_of_update(dimension: int, rank: int) -> dict[str, Any]:
     task = kreps.TaskSpec(dimension, [-1.0], [1.0], groups=(tuple(range(dimension)),))
     learner = kreps.KREPS(
         task,
-        recipe="observed",
+        preset="single_step",
         window=None,
-        approximation="uniform",
-        rank=rank,
-        max_rank=rank,
+        low_rank=kreps.LowRank(rank=rank, above=0),
+        value=kreps.RKHS(max_rank=rank, tolerance=1e-12),
     )
     rollouts = walks(dimension)
     started = time.process_time()
@@ -329,13 +325,16 @@ def seconds_of_update(dimension: int, rank: int) -> dict[str, Any]:
         "dimension": dimension,
         "rank": rank,
         "cpu_seconds": seconds,
+        "rank_of_v": info.rank,
+        "support": info.support,
         "newton_iterations": info.dual.iterations,
         "stages": info.seconds,
     }
 
 
 def growth(out: Path) -> None:
-    by_rank = [seconds_of_update(2, rank) for rank in BASES]
+    # In many coordinates a basis is not complete before it has the wanted rank.
+    by_rank = [seconds_of_update(32, rank) for rank in BASES]
     by_dimension = [seconds_of_update(dimension, 200) for dimension in DIMENSIONS]
     with rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.2), layout="constrained")
@@ -351,7 +350,7 @@ def growth(out: Path) -> None:
             axis.set_xticks(x, [str(value) for value in x])
             axis.minorticks_off()
         left, right = figure.axes
-        left.set_xlabel("rank of every basis (2 coordinates)")
+        left.set_xlabel("rank of every basis (32 coordinates)")
         right.set_xlabel("coordinates of an observation (rank 200)")
         left.set_ylabel("CPU seconds, n = 20,000")
         left.legend(frameon=False)

@@ -180,7 +180,7 @@ def show(figure: Figure, name: str) -> None:
 
 # %%
 rng = np.random.default_rng(args.seed)
-explorer = Gaussian(task, spread=0.7)  # in units of the largest velocity
+explorer = Gaussian(task, scale=0.7)  # in units of the largest velocity
 rollouts = simulate(explorer, args.rollouts, rng)
 data = ReplayWindow(args.rollouts).extend(rollouts).transitions
 n = len(data)
@@ -540,7 +540,7 @@ average_before, average_after = (average_reward(each) for each in fresh)
 
 with rc_context(STYLE):
     figure, (left, middle, right) = panels(1, 3, 3.1)
-    zeros, spread = np.zeros_like(GRID), explorer.spread * task.action_scale[0]
+    zeros, spread = np.zeros_like(GRID), explorer.scale * task.action_scale[0]
     mean = policy.mean(GRID[:, None])[:, 0]
     sd = policy.standard_deviation(GRID[:, None])[:, 0]
     for axes, centre, width, area, title in (

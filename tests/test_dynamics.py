@@ -13,7 +13,7 @@ from kreps.kernels import regression as embedding
 from kreps.kernels.arrays import FloatArray, as_float
 from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.kernel import Kernel, SquaredExponential
-from kreps.kernels.regression import ROWS, FeatureRegression, KernelEmbedding
+from kreps.kernels.regression import PREDICTION_BATCH, FeatureRegression, KernelEmbedding
 from kreps.models.dynamics import (
     DeltaStateTargets,
     Dynamics,
@@ -132,7 +132,7 @@ def test_without_noise_it_says_where_any_action_leads() -> None:
 
 @pytest.fixture
 def nothing_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(embedding, "NEGLIGIBLE", 1e-10)
+    monkeypatch.setattr(embedding, "MAX_RESIDUAL_RATIO", 1e-10)
 
 
 def fitted(data: Transitions, kernel: Kernel) -> tuple[Dynamics, KernelEmbedding]:
@@ -257,7 +257,7 @@ def test_many_inputs_are_predicted_block_by_block() -> None:
     data = pushes(noise=0.1)
     kernel, basis, features = basis_of(data)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
-    rows = np.random.default_rng(3).integers(len(data), size=ROWS + 7)
+    rows = np.random.default_rng(3).integers(len(data), size=PREDICTION_BATCH + 7)
     inputs = state_actions(data, TASK)[rows]
     found = dynamics.expected_features(basis, features[0], rows, inputs)
     last = dynamics.expected_features(basis, features[0], rows[-7:], inputs[-7:])

@@ -176,7 +176,7 @@ def test_factor_distances_stack_the_factors() -> None:
 def box(parameters: FloatArray, half_width: float, strength: float = 0.0) -> Prior:
     return Prior(
         centre=parameters,
-        spread=np.ones_like(parameters),
+        std=np.ones_like(parameters),
         low=parameters - half_width,
         high=parameters + half_width,
         strength=strength,
@@ -186,7 +186,7 @@ def box(parameters: FloatArray, half_width: float, strength: float = 0.0) -> Pri
 def test_a_prior_is_a_sum_of_gaussians() -> None:
     prior = Prior(
         centre=np.array([1.0, -2.0]),
-        spread=np.array([0.5, 3.0]),
+        std=np.array([0.5, 3.0]),
         low=np.full(2, -9.0),
         high=np.full(2, 9.0),
         strength=0.7,

@@ -18,6 +18,7 @@ from kreps.data.task import TaskSpec
 from kreps.envs.image_swing_up import PIXELS, image
 from kreps.errors import ConfigurationError, StorageError
 from kreps.kernels.arrays import FloatArray
+from kreps.kernels.gram import squared_distances
 from kreps.kernels.kernel import (
     IMAGE_BLUR,
     Kernel,
@@ -25,7 +26,6 @@ from kreps.kernels.kernel import (
     SquaredExponential,
     factors_of,
     median_lengthscales,
-    squared_distances,
 )
 from kreps.kernels.regression import KernelEmbedding, SampleModel
 from kreps.models.transition import state_kernel, successor_features
@@ -40,7 +40,7 @@ DEGREES = np.arange(0, 181, 5)
 def distances_from_start(factor: SmoothedImage | SquaredExponential, start: float) -> FloatArray:
     """Of the rod at ``start`` (rad) and turned by each of `DEGREES`; of opposite rods: one."""
     pictures = image(start + np.deg2rad(DEGREES))
-    distances: FloatArray = np.sqrt(squared_distances(factor, pictures)[0])
+    distances: FloatArray = np.sqrt(squared_distances(factor.coordinates(pictures))[0])
     return distances / distances[-1]
 
 
@@ -62,7 +62,7 @@ def test_gram_matrices_are_positive_semi_definite(shape: tuple[int, int]) -> Non
     # the product of one Gaussian for each image
     wanted = np.ones_like(gram)
     for factor, lengthscale in zip(factors, kernel.lengthscales, strict=True):
-        wanted *= np.exp(-0.5 * squared_distances(factor, x) / lengthscale**2)
+        wanted *= np.exp(-0.5 * squared_distances(factor.coordinates(x)) / lengthscale**2)
     np.testing.assert_allclose(gram, wanted, atol=1e-12)
 
 

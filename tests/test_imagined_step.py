@@ -450,7 +450,7 @@ def test_in_low_rank_it_comes_near_the_exact_update(
     model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in (embedding, policies):  # the exact one leaves out what noise hides
-        monkeypatch.setattr(module, "NEGLIGIBLE", 1e-9)
+        monkeypatch.setattr(module, "MAX_RESIDUAL_RATIO", 1e-9)
     full: dict[str, Any] = {"basis_tolerance": 1e-9, "max_rank": 5000, "rank": 5000}
     rollouts = pushes(terminated=True)
     exact, wanted = updated(rollouts, approximation="exact", model=model, **full)
@@ -638,7 +638,7 @@ def test_the_deviation_of_a_policy_can_be_less_and_its_mean_the_same() -> None:
     samples = PolicyTargets(states, targets, rng.uniform(0.5, 1.0, size=40), 30.0, np.zeros(40))
     asked = 3.0 * rng.normal(size=(20, 2))
     basis, features = RKHSBasis.fit(kernel, states, tolerance=1e-6, max_rank=20)
-    sums = PolicySums.of(features, samples.weights, targets)
+    sums = PolicySums.from_samples(features, samples.weights, targets)
     sparse = SparseGP.fit(TASK, basis, sums, signal=0.8, noise=0.5)
     pairs: list[tuple[Any, ...]] = [
         tuple(fit_policy(replace(samples, spread=s), kernel, TASK, x, n) for n in (1.0, 2.0))

@@ -140,7 +140,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 def nothing_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """The exact update leaves out of the dynamics what their noise hides; here next to nothing."""
     for module in (embedding, policies):
-        monkeypatch.setattr(module, "NEGLIGIBLE", 1e-9)
+        monkeypatch.setattr(module, "MAX_RESIDUAL_RATIO", 1e-9)
 
 
 @pytest.mark.usefixtures("nothing_left_out")

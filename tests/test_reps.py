@@ -26,7 +26,13 @@ from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.errors import DataError
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.hyperparameters import TOLERANCE, PolicyLoss, Prior, factor_distances, minimise
+from kreps.kernels.hyperparameters import (
+    LOSS_TOLERANCE,
+    PolicyLoss,
+    Prior,
+    factor_distances,
+    minimise,
+)
 from kreps.kernels.kernel import Kernel, factors_of
 from kreps.models import transition as transition_model
 from kreps.models.transition import feature_differences, restart_features, successor_features
@@ -268,7 +274,7 @@ def test_policy_hyperparameters_are_the_most_probable_ones() -> None:
 
     best = scipy.optimize.minimize(objective, centre, method="BFGS", options={"gtol": 1e-6})
     np.testing.assert_allclose(found, best.x, atol=0.05)
-    assert objective(found) == pytest.approx(best.fun, abs=TOLERANCE)
+    assert objective(found) == pytest.approx(best.fun, abs=LOSS_TOLERANCE)
 
 
 def test_bounded_policy_hyperparameters_keep_to_their_ranges() -> None:

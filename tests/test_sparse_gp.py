@@ -12,7 +12,7 @@ from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.gram import gaussian_gram
 from kreps.kernels.kernel import Kernel, factors_of
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
-from kreps.policies.sparse_gp import ROWS, PolicySums, SparseGP
+from kreps.policies.sparse_gp import TRIANGULAR_BLOCK_ROWS, PolicySums, SparseGP
 
 TASK = TaskSpec(2, np.array([-1.0, 10.0]), np.array([1.0, 30.0]))
 CENTRE, SCALE = np.array([0.0, 20.0]), np.array([1.0, 10.0])
@@ -65,7 +65,7 @@ def fit(policy: CostSensitiveGP, centres: int, tolerance: float = 0.0) -> Sparse
     basis, features = RKHSBasis.fit(
         policy.kernel, policy.states, tolerance=tolerance, max_rank=centres
     )
-    sums = PolicySums.of(features, policy.weights, policy.targets)
+    sums = PolicySums.from_samples(features, policy.weights, policy.targets)
     return SparseGP.fit(TASK, basis, sums, policy.signal, policy.noise)
 
 
@@ -116,8 +116,8 @@ def test_a_sample_of_weight_three_counts_as_three_samples() -> None:
     weights = np.random.default_rng(6).integers(1, 4, size=40)
     basis, features = RKHSBasis.fit(KERNEL, states, tolerance=0.0, max_rank=10)
     rows = np.repeat(np.arange(40), weights)
-    once = PolicySums.of(features, weights.astype(np.float64), targets)
-    repeated = PolicySums.of(features[rows], np.ones(len(rows)), targets[rows])
+    once = PolicySums.from_samples(features, weights.astype(np.float64), targets)
+    repeated = PolicySums.from_samples(features[rows], np.ones(len(rows)), targets[rows])
     a, b = (SparseGP.fit(TASK, basis, sums, SIGNAL, NOISE) for sums in (once, repeated))
     np.testing.assert_allclose(a.greedy(FAR), b.greedy(FAR), rtol=1e-10)
     at = queries(50, 7)
@@ -131,20 +131,20 @@ def test_a_sample_of_weight_three_counts_as_three_samples() -> None:
 def test_sums_are_those_of_their_definition() -> None:
     rng = np.random.default_rng(8)
     z, w, u = rng.normal(size=(30, 4)), rng.uniform(0.1, 2.0, 30), rng.normal(size=(30, 2))
-    sums = PolicySums.of(z, w, u)
+    sums = PolicySums.from_samples(z, w, u)
     precision = sum(w[i] * np.outer(z[i], z[i]) for i in range(30))
-    pull = sum(w[i] * np.outer(z[i], u[i]) for i in range(30))
+    weighted_targets = sum(w[i] * np.outer(z[i], u[i]) for i in range(30))
     np.testing.assert_allclose(sums.precision, precision, atol=1e-12)
-    np.testing.assert_allclose(sums.pull, pull, atol=1e-12)
+    np.testing.assert_allclose(sums.weighted_targets, weighted_targets, atol=1e-12)
 
 
 @pytest.mark.parametrize("cuts", [[10], [1, 2, 59], [20, 40]])
 def test_sums_add_up_over_chunks(cuts: list[int]) -> None:
     policy = exact(60, 9)
     basis, features = RKHSBasis.fit(KERNEL, policy.states, tolerance=0.0, max_rank=12)
-    whole = PolicySums.of(features, policy.weights, policy.targets)
+    whole = PolicySums.from_samples(features, policy.weights, policy.targets)
     chunks = [
-        PolicySums.of(*parts)
+        PolicySums.from_samples(*parts)
         for parts in zip(
             *(np.split(a, cuts) for a in (features, policy.weights, policy.targets)), strict=True
         )
@@ -153,7 +153,9 @@ def test_sums_add_up_over_chunks(cuts: list[int]) -> None:
     for chunk in chunks[1:]:
         total = total + chunk
     np.testing.assert_allclose(total.precision, whole.precision, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(total.pull, whole.pull, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(
+        total.weighted_targets, whole.weighted_targets, rtol=1e-12, atol=1e-12
+    )
     at = queries(50, 10)
     a, b = (SparseGP.fit(TASK, basis, sums, SIGNAL, NOISE) for sums in (whole, total))
     np.testing.assert_allclose(a.greedy(at), b.greedy(at), atol=1e-9)
@@ -252,13 +254,13 @@ def test_kernel_values_are_those_of_gaussian_gram() -> None:
 
 def test_a_triangular_matrix_is_multiplied_in_pieces_that_give_the_same() -> None:
     """Where the kernel is so rough that every support point is a centre."""
-    count = 2 * ROWS + 17
+    count = 2 * TRIANGULAR_BLOCK_ROWS + 17
     rough = exact(count, 27, KERNEL.with_lengthscales(np.array([0.02, 0.02])))
     few = rough.predictor
     assert len(few.states) == count
-    assert [rows.shape for rows in few._explained_rows] == [
-        (ROWS, ROWS),
-        (ROWS, 2 * ROWS),
+    assert [rows.shape for rows in few._explained_blocks] == [
+        (TRIANGULAR_BLOCK_ROWS, TRIANGULAR_BLOCK_ROWS),
+        (TRIANGULAR_BLOCK_ROWS, 2 * TRIANGULAR_BLOCK_ROWS),
         (17, count),
     ]
     at = np.concatenate([rough.states, queries(20, 28)])
@@ -271,6 +273,10 @@ def test_a_triangular_matrix_is_multiplied_in_pieces_that_give_the_same() -> Non
 
 
 def test_a_full_matrix_is_multiplied_whole() -> None:
-    few = exact(2 * ROWS, 29, KERNEL.with_lengthscales(np.array([0.1, 0.1]))).compressed(ROWS + 9)
-    assert len(few.states) == ROWS + 9
-    assert [rows.shape for rows in few._explained_rows] == [(ROWS + 9, ROWS + 9)]
+    few = exact(
+        2 * TRIANGULAR_BLOCK_ROWS, 29, KERNEL.with_lengthscales(np.array([0.1, 0.1]))
+    ).compressed(TRIANGULAR_BLOCK_ROWS + 9)
+    assert len(few.states) == TRIANGULAR_BLOCK_ROWS + 9
+    assert [rows.shape for rows in few._explained_blocks] == [
+        (TRIANGULAR_BLOCK_ROWS + 9, TRIANGULAR_BLOCK_ROWS + 9)
+    ]

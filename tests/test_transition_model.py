@@ -10,7 +10,7 @@ from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.hyperparameters import EmbeddingLoss, Prior
 from kreps.kernels.sampling import (
-    FIT_SAMPLE,
+    FIT_SAMPLE_SIZE,
     effective_target_count,
     inclusion_probabilities,
     pps_subsample,
@@ -31,8 +31,8 @@ def heavy_tailed(n: int = 1500) -> FloatArray:
 
 
 def test_few_rows_are_all_taken() -> None:
-    rows, weights = pps_subsample(heavy_tailed(FIT_SAMPLE), np.random.default_rng(0))
-    np.testing.assert_array_equal(rows, np.arange(FIT_SAMPLE))
+    rows, weights = pps_subsample(heavy_tailed(FIT_SAMPLE_SIZE), np.random.default_rng(0))
+    np.testing.assert_array_equal(rows, np.arange(FIT_SAMPLE_SIZE))
     np.testing.assert_array_equal(weights, 1.0)
 
 
@@ -42,7 +42,7 @@ def test_sums_over_the_rows_are_those_of_all_on_average(squares: FloatArray) -> 
     found = []
     for seed in range(400):
         rows, weights = pps_subsample(squares, np.random.default_rng(seed))
-        assert len(np.unique(rows)) == len(rows) and abs(len(rows) - FIT_SAMPLE) <= 1
+        assert len(np.unique(rows)) == len(rows) and abs(len(rows) - FIT_SAMPLE_SIZE) <= 1
         found.append(weights @ summed[rows])
     error = np.std(found) / np.sqrt(len(found))
     assert np.mean(found) == pytest.approx(summed.sum(), abs=4.0 * error + 1e-9)

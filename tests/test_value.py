@@ -7,7 +7,7 @@ import pytest
 
 from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.basis import MAX_CENTRES, Basis, FourierBasis, RBFGrid, RKHSBasis
+from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis
 from kreps.kernels.kernel import Kernel, factors_of
 
 KERNEL = Kernel(factors_of(2, periodic=(0,)), np.array([1.0, 1.5]))
@@ -102,7 +102,7 @@ def test_a_grid_of_radial_basis_functions() -> None:
 
 def test_a_grid_over_data_has_its_lengthscale_for_spacing() -> None:
     points = np.array([[0.3, -2.0], [5.0, 1.0], [-4.0, 4.0]])
-    grid, features = RBFGrid.over(factors_of(2, periodic=(0,)), points, 4)
+    grid, features = RBFGrid.from_points(factors_of(2, periodic=(0,)), points, 4)
     assert features.shape == (3, 16)
     np.testing.assert_array_equal(features, grid.features(points))
     # The angle gets a whole turn without its end, the velocity the range of the data.
@@ -122,146 +122,45 @@ def test_a_grid_over_data_has_its_lengthscale_for_spacing() -> None:
 @pytest.mark.parametrize("size", [1, 2, 5])
 def test_a_grid_of_any_size_covers_the_data(size: int, periodic: tuple[int, ...]) -> None:
     points = np.random.default_rng(13).uniform(-1.0, 1.0, size=(50, 1))
-    _, features = RBFGrid.over(factors_of(1, periodic), points, size)
+    _, features = RBFGrid.from_points(factors_of(1, periodic), points, size)
     assert features.shape == (50, size)
     assert features.max(axis=1).min() > 0.1  # no point is far from all centres
 
 
 def test_a_coordinate_without_range_does_not_spoil_the_grid() -> None:
     points = np.column_stack([np.full(9, 0.7), np.linspace(0.0, 1.0, 9)])
-    grid, features = RBFGrid.over(factors_of(2), points, 3)
+    grid, features = RBFGrid.from_points(factors_of(2), points, 3)
     assert np.isfinite(features).all()
     assert features.max(axis=1).min() > 0.5
     np.testing.assert_allclose(grid.kernel.lengthscales, [1.0, 0.5])
 
 
 def test_a_grid_too_large_to_solve_is_refused() -> None:
-    with pytest.raises(ConfigurationError, match=str(MAX_CENTRES)):
-        RBFGrid.over(factors_of(4), np.random.default_rng(14).normal(size=(5, 4)), 9)
+    with pytest.raises(ConfigurationError, match=r"9\^4 centres, but at most 4096.*kreps\.RKHS"):
+        RBFGrid.from_points(factors_of(4), np.random.default_rng(14).normal(size=(5, 4)), 9)
 
 
-# Pivots at random, and random Fourier features
+def bases(points: FloatArray) -> dict[str, Basis]:
+    """One of each kind, with sixteen features."""
+    return {
+        "pivoted": RKHSBasis.fit(KERNEL, points, tolerance=1e-4, max_rank=16)[0],
+        "grid": RBFGrid.from_points(KERNEL.factors, points, 4)[0],
+    }
 
 
-def rms_error(basis: Basis, points: FloatArray) -> float:
-    """Of the inner products of features as values of the kernel."""
-    phi = basis.features(points)
-    return float(np.sqrt(np.mean((phi @ phi.T - KERNEL.gram(points)) ** 2)))
-
-
-def uniform(points: FloatArray, rank: int, seed: int = 0) -> RKHSBasis:
-    return RKHSBasis.uniform(KERNEL, points, max_rank=rank, rng=np.random.default_rng(seed))
-
-
-def fourier(rank: int, seed: int = 0) -> FourierBasis:
-    return FourierBasis.draw(KERNEL, 2, max_rank=rank, rng=np.random.default_rng(seed))
-
-
-def test_pivots_at_random_are_different_rows_of_the_points() -> None:
-    points = states(200, 15)
-    basis = uniform(points, 30)
-    rows = [int(np.flatnonzero((points == pivot).all(axis=1))[0]) for pivot in basis.pivots]
-    assert len(set(rows)) == 30
-    assert max(rows) > 100 > min(rows)
-    assert not np.array_equal(uniform(points, 30, seed=1).pivots, basis.pivots)
-    np.testing.assert_array_equal(uniform(points, 30).pivots, basis.pivots)
-
-
-def test_features_of_random_pivots_are_nystroems() -> None:
-    points = states(120, 16)
-    basis = uniform(points, 25)
-    phi = basis.features(points)
-    across = KERNEL.gram(points, basis.pivots)
-    wanted = across @ np.linalg.solve(KERNEL.gram(basis.pivots), across.T)
-    # The condition of the pivots' Gram matrix, 1e5, takes that many digits.
-    np.testing.assert_allclose(phi @ phi.T, wanted, atol=1e-9)
-    missing = np.diagonal(KERNEL.gram(points) - wanted).max()
-    assert basis.residual == pytest.approx(missing, abs=1e-9)
-    assert missing > 1e-3
-
-
-def test_more_random_pivots_than_points_are_all_points() -> None:
-    points = states(40, 17)
-    basis = uniform(points, 1000)
-    assert len(basis.pivots) == 40
-    assert rms_error(basis, points) < 1e-9
-    assert 0.0 <= basis.residual < 1e-8
-
-
-def test_random_pivots_among_duplicated_states_are_survived() -> None:
-    points = np.tile(states(10, 18), (4, 1))
-    basis = uniform(points, 40)
-    # A singular Gram matrix gets 1e-12 of jitter, which is all that the features lack.
-    assert rms_error(basis, points) < 1e-11
-    assert basis.residual < 1e-11
-
-
-def test_chosen_pivots_represent_more_than_random_ones() -> None:
-    points = states(300, 19)
-    chosen, _ = RKHSBasis.fit(KERNEL, points, tolerance=1e-12, max_rank=30)
-    # Measured on three sets of points: at random 10 to 30 times the residual, 1.6 to 5 times the
-    # error on average over all pairs.
-    drawn = [uniform(points, 30, seed) for seed in range(5)]
-    assert chosen.residual < 0.2 * min(basis.residual for basis in drawn)
-    assert rms_error(chosen, points) < min(rms_error(basis, points) for basis in drawn)
-
-
-def test_inner_products_of_fourier_features_estimate_the_kernel() -> None:
-    points = states(60, 20)
-    grams = [phi @ phi.T for phi in (fourier(100, seed).features(points) for seed in range(200))]
-    np.testing.assert_allclose(np.diagonal(grams[0]), 1.0, rtol=1e-12)
-    # 200 x 50 frequencies leave at most 1 / sqrt(2 x 10,000) = 0.007 as the standard deviation.
-    assert np.abs(np.mean(grams, axis=0) - KERNEL.gram(points)).max() < 5 * 0.0071
-
-
-def test_the_error_of_fourier_features_falls_with_the_root_of_their_number() -> None:
-    points = states(60, 21)
-
-    def error(rank: int) -> float:
-        return float(np.mean([rms_error(fourier(rank, seed), points) for seed in range(20)]))
-
-    few, some, many = error(32), error(512), error(8192)
-    # 16 times as many make it a quarter, up to what is left to chance in the mean of 20 draws;
-    # measured: 4.5 and 3.8.
-    assert few / some == pytest.approx(4.0, rel=0.2)
-    assert some / many == pytest.approx(4.0, rel=0.2)
-
-
-@pytest.mark.parametrize(("asked", "made"), [(1, 2), (2, 2), (7, 6), (100, 100)])
-def test_fourier_features_come_in_pairs(asked: int, made: int) -> None:
-    assert fourier(asked).features(states(3, 22)).shape == (3, made)
-
-
-def test_fourier_features_are_periodic_where_their_kernel_is() -> None:
-    basis, points = fourier(50), states(20, 23)
-    value = basis.function(np.random.default_rng(24).normal(size=50))
-    turn = 2.0 * np.pi * np.eye(2)
-    np.testing.assert_allclose(basis.features(points + turn[0]), basis.features(points), atol=1e-12)
-    np.testing.assert_allclose(value(points - turn[0]), value(points), atol=1e-11)
-    assert not np.allclose(value(points + turn[1]), value(points), atol=0.1)
-
-
-@pytest.mark.parametrize("name", ["pivoted", "uniform", "fourier", "grid"])
+@pytest.mark.parametrize("name", ["pivoted", "grid"])
 @pytest.mark.parametrize("outputs", [(), (3,)])
 def test_a_function_is_the_product_of_features_and_theta(
     outputs: tuple[int, ...], name: str
 ) -> None:
-    points, new = states(80, 25), states(30, 26)
-    bases: dict[str, Basis] = {
-        "pivoted": RKHSBasis.fit(KERNEL, points, tolerance=1e-4, max_rank=16)[0],
-        "uniform": uniform(points, 16),
-        "fourier": fourier(16),
-        "grid": RBFGrid.over(KERNEL.factors, points, 4)[0],
-    }
-    basis = bases[name]
+    basis, new = bases(states(80, 25))[name], states(30, 26)
     theta = np.random.default_rng(27).normal(size=(16, *outputs))
     value = basis.function(theta)(new)
     assert value.shape == (30, *outputs)
     np.testing.assert_allclose(value, basis.features(new) @ theta, atol=1e-8)
 
 
-def test_no_states_have_no_features() -> None:
-    # As a chunk of samples without weight has them.
-    nothing = np.empty((0, 2))
-    assert uniform(states(20, 28), 5).features(nothing).shape == (0, 5)
-    assert fourier(6).features(nothing).shape == (0, 6)
+@pytest.mark.parametrize("name", ["pivoted", "grid"])
+def test_no_states_have_no_features(name: str) -> None:
+    # A chunk in which all samples have weight zero passes no states.
+    assert bases(states(80, 25))[name].features(np.empty((0, 2))).shape == (0, 16)

@@ -60,7 +60,7 @@ class ExactBatch:
         data, value = self.data, self.settings.value
         basis: Basis
         if isinstance(value, Grid):
-            basis, phi = RBFGrid.over(kernel.factors, data.points, value.size)
+            basis, phi = RBFGrid.from_points(kernel.factors, data.points, value.size)
         else:
             kernel = with_wrap_discontinuity(kernel, data, self.task, value)
             basis, phi = RKHSBasis.fit(

@@ -138,7 +138,7 @@ class LowRankBatch:
     def value_features(self, kernel: Kernel) -> StreamedFeatures:
         value, data, to_device = self.settings.value, self.data, self.compute.to_device
         if isinstance(value, Grid):
-            basis: Basis = RBFGrid.over(kernel.factors, data.points, value.size)[0]
+            basis: Basis = RBFGrid.from_points(kernel.factors, data.points, value.size)[0]
         else:
             kernel = with_wrap_discontinuity(kernel, data, self.task, value)
             basis = self._centres(kernel, data.points, value.max_rank, value.tolerance)
@@ -301,7 +301,7 @@ class LowRankBatch:
         x = policy_hyperparameters(targets, kernel, self.settings.policy_fit, start, rng)
         centres = self._policy_centres(targets, kernel, x)
         weights, noise = exploration_noise(targets, float(np.exp(x[-1])))
-        sums = PolicySums.of(centres.features(targets.states), weights, targets.targets)
+        sums = PolicySums.from_samples(centres.features(targets.states), weights, targets.targets)
         return self._sparse_policy(centres, sums, x, noise, std_scale)
 
     def fit_reward(
@@ -314,7 +314,7 @@ class LowRankBatch:
             inputs, targets, kernel, self.task, start, rng
         )
         basis = self._centres(fitted, inputs, self.low_rank.rank)
-        sums = RegressionSums.of(basis.features(inputs), targets)
+        sums = RegressionSums.from_samples(basis.features(inputs), targets)
         # scaled by the subsampling fraction, so that the subsample regularises like the full data
         model = self._regression(basis, sums, regulariser * len(self.data) / self.size)
         return model.mean, x
@@ -350,9 +350,7 @@ class LowRankBatch:
         self, kernel: Kernel, points: FloatArray, rank: int, tolerance: float = TOLERANCE
     ) -> RKHSBasis:
         """At most ``rank`` features of a kernel, centred at some of the points (m, d)."""
-        basis, _ = RKHSBasis.fit(kernel, points, tolerance=tolerance, max_rank=rank)
-        self.jitters.append(basis.jitter)
-        return basis
+        return RKHSBasis.fit(kernel, points, tolerance=tolerance, max_rank=rank)[0]
 
 
 def subsample(rows: IntArray, size: int, rng: np.random.Generator) -> IntArray:

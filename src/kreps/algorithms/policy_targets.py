@@ -161,7 +161,7 @@ def policy_hyperparameters(
     if policy_fit == "map":
         prior = Prior(
             centre=centre,
-            spread=np.concatenate([np.full(g, 0.7), [1.0, 1.0]]),
+            std=np.concatenate([np.full(g, 0.7), [1.0, 1.0]]),
             low=np.concatenate([median - 4.0, np.log([1e-4, 1e-4])]),
             high=np.concatenate([median + 3.0, np.log([1e2, 1e2])]),
             strength=1.0 / samples.total_weight,
@@ -169,7 +169,7 @@ def policy_hyperparameters(
     else:
         prior = Prior(
             centre=centre,
-            spread=np.ones(g + 2),
+            std=np.ones(g + 2),
             low=np.concatenate([median + np.log(0.3), np.log([0.01, 1e-4])]),
             high=np.concatenate([median, np.log([3.0, 4.0])]),
             strength=0.0,

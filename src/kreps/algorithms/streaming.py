@@ -114,7 +114,7 @@ class EmbeddingSums:
         data = chunk.load().transitions
         own, after = self.changes.both(data)
         psi = self.embedded.features(self.changes.to_device(state_actions(data, self.task)))
-        return RegressionSums.of(psi, after - own if self.relative_to_state else after)
+        return RegressionSums.from_samples(psi, after - own if self.relative_to_state else after)
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,8 @@ class DeltaStateSums:
     def __call__(self, chunk: Chunk) -> RegressionSums:
         data = chunk.load().transitions
         psi = self.embedded.features(self.to_device(state_actions(data, self.task)))
-        return RegressionSums.of(psi, self.to_device(self.delta_targets.targets(data, self.task)))
+        targets = self.to_device(self.delta_targets.targets(data, self.task))
+        return RegressionSums.from_samples(psi, targets)
 
 
 class Successors(Protocol):
@@ -302,4 +303,4 @@ class ChunkPolicySums:
         kept = np.flatnonzero(weights)
         z = self.basis.features(self.to_device(data.states[kept]))
         targets = self.task.scaled(data.actions[kept])
-        return PolicySums.of(z, like(weights[kept], z), like(targets, z))
+        return PolicySums.from_samples(z, like(weights[kept], z), like(targets, z))

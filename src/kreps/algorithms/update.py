@@ -100,6 +100,6 @@ def report(batch: Batch[Any, Any], step: Step, rejected: bool | None) -> UpdateI
         policy_parameters=np.exp(step.policy.x),
         noise=step.policy.noise,
         rejected=rejected,
-        jitter=max(step.dual.jitter, *batch.jitters),
+        jitter=max([step.dual.jitter, *batch.jitters]),
         seconds=batch.clock.seconds,
     )

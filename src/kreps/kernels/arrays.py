@@ -1,8 +1,8 @@
-"""The array types the library speaks, and the conversions at its borders.
+"""Array types, and conversions between array libraries.
 
-Whatever grows with the number of samples is computed in the array library that the samples come
-in: NumPy, or any other that follows the array API standard (CuPy, PyTorch).  What is left then, of
-the size of a basis, is NumPy.
+Everything that grows with the number of samples is computed in the array library of the samples:
+NumPy, or any other that follows the array API standard, such as CuPy and PyTorch.  Results of the
+size of a basis are NumPy arrays on the CPU.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ IntArray = NDArray[np.intp]
 BoolArray = NDArray[np.bool_]
 
 Array = Any
-"""Floats (float64) of any library that follows the array API standard."""
+"""An array of float64 of any library that follows the array API standard."""
 
 
 def as_float(values: Any) -> FloatArray:
@@ -28,7 +28,7 @@ def as_float(values: Any) -> FloatArray:
 
 
 def namespace(array: Array) -> Any:
-    """The functions of the library that ``array`` is of."""
+    """The array API namespace of the library that ``array`` belongs to."""
     return np if isinstance(array, np.ndarray) else array_api_compat.array_namespace(array)
 
 
@@ -41,7 +41,7 @@ def like(values: FloatArray, other: Array) -> Array:
 
 
 def as_numpy(array: Array) -> FloatArray:
-    """``array`` in NumPy, on the CPU."""
+    """``array`` as a NumPy array on the CPU; no copy if it is one already."""
     if isinstance(array, np.ndarray):
         return array
     if array_api_compat.is_torch_array(array):
@@ -52,7 +52,7 @@ def as_numpy(array: Array) -> FloatArray:
 
 
 def columns(array: Array, chosen: Sequence[int] | IntArray) -> Array:
-    """``array[:, chosen]``."""
+    """``array[:, chosen]``, also for libraries without indexing by arrays."""
     if isinstance(array, np.ndarray):
         return array[:, chosen]
     xp = namespace(array)
@@ -60,7 +60,7 @@ def columns(array: Array, chosen: Sequence[int] | IntArray) -> Array:
 
 
 def rows(array: Array, chosen: IntArray) -> Array:
-    """``array[chosen]``."""
+    """``array[chosen]``, also for libraries without indexing by arrays."""
     if isinstance(array, np.ndarray):
         return array[chosen]
     xp = namespace(array)
@@ -68,5 +68,5 @@ def rows(array: Array, chosen: IntArray) -> Array:
 
 
 def grid_points(axes: Sequence[FloatArray]) -> FloatArray:
-    """Every combination (m, d) of one value of each of d axes; the last axis runs fastest."""
+    """All combinations (m, d) of one value from each of d axes; the last axis varies fastest."""
     return np.stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")], axis=1)

@@ -1,7 +1,7 @@
 """Leave-one-out fits of lengthscales and regularisers, in closed form with analytic gradients.
 
-Both criteria depend on their parameters through one matrix ``C = K + noise`` and need only
-``C^-1``.  Each is minimised over log parameters, on a sample of the data.
+Both losses depend on their parameters through one matrix ``C = K + noise`` and need only ``C^-1``.
+Each is minimised over log parameters on a subsample of the data (`kreps.kernels.sampling`).
 """
 
 from __future__ import annotations
@@ -14,8 +14,24 @@ from scipy.optimize import minimize
 
 from kreps.errors import NumericalError
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.kernel import Factor, squared_distances
+from kreps.kernels.gram import squared_distances
+from kreps.kernels.kernel import Factor
 from kreps.kernels.linalg import cholesky, with_diagonal
+
+LOSS_TOLERANCE = 1e-3
+"""Decrease of the loss below which an iteration ends a fit, as a share of the loss or of one,
+whichever is larger.  The losses are logarithms, and their estimates from some hundred samples are
+less precise than this."""
+
+MAX_ITERATIONS = 30
+"""Largest number of iterations of a fit.  Fits start where those of the previous update ended, so
+that one which stops here is continued by the next update."""
+
+REJECTED_LOSS = 1e10
+"""Loss of parameters whose matrix cannot be factorised; it makes the line search step back."""
+
+MIN_SQUARED_ERROR = 1e-200
+"""Smallest mean squared error whose logarithm is taken: that of targets which are all zero."""
 
 
 @dataclass(frozen=True)
@@ -23,14 +39,16 @@ class EmbeddingLoss:
     """Leave-one-out error of the conditional embedding as a predictor of features.
 
     ``log mean_i w_i |e_i|^2`` with ``e_i = [C^-1 F']_i / [C^-1]_ii`` and
-    ``C = K_sa + lambda diag(1 / w_i)``: the i-th successor's features less their prediction from
-    all other samples.  Weights count in both: a kind of sample that was chosen more often than
-    others would else be expected more often.  Parameters: g log lengthscales, then log lambda.
+    ``C = K_sa + lambda diag(1 / w_i)``: the features of the i-th successor less their prediction
+    from all other samples.  The weights w enter the mean and the regulariser, so that samples which
+    were drawn with a higher probability are not predicted with a higher one.
+
+    The parameters are g log lengthscales, then log lambda.
 
     Attributes:
         distances: (g, m, m) squared distances of each factor at lengthscale one.
         features: (m, r) successor features F'.
-        weights: (m,) the w_i, one on average: in which proportion these stand for all samples.
+        weights: (m,) inverse inclusion probabilities w_i, scaled to a mean of one.
     """
 
     distances: FloatArray
@@ -50,7 +68,7 @@ class EmbeddingLoss:
         return cholesky(with_diagonal(gram, regulariser / self.weights)).inverse()
 
     def __call__(self, x: FloatArray) -> tuple[float, FloatArray]:
-        """Value and gradient (g + 1,)."""
+        """Value and gradient (g + 1,) at parameters ``x`` (g + 1,)."""
         gram, regulariser = self._gram(x)
         inverse = self._inverse(gram, regulariser)
         d = np.diagonal(inverse)
@@ -58,7 +76,7 @@ class EmbeddingLoss:
         e = a / d[:, None]
         share = self.weights / len(d)
         squares = share * np.einsum("ij,ij->i", e, e)
-        total = max(float(squares.sum()), 1e-200)  # nothing to predict: a state that never moves
+        total = max(float(squares.sum()), MIN_SQUARED_ERROR)
         # d total = 2 <dC, M>: de_i = -[C^-1 dC a]_i / d_i + e_i [C^-1 dC C^-1]_ii / d_i
         half = inverse * np.sqrt(squares / d)
         m = half @ half.T - a @ ((e * (share / d)[:, None]).T @ inverse)
@@ -73,19 +91,21 @@ class EmbeddingLoss:
 
 @dataclass(frozen=True)
 class PolicyLoss:
-    """Weighted leave-one-out log density of the cost-sensitive Gaussian process, negated.
+    """Negative weighted leave-one-out log density of the cost-sensitive Gaussian process.
 
     ``-sum_i p_i log N(u_i; mu_-i, sigma^2_-i)``: the expected KL divergence of Sec. 2 up to a
-    constant, each sample judged by the policy that the *other* samples make.  The density is that
-    of a command, so its variance has the noise l once, not the l / w_i of a sample.  Parameters:
-    g log lengthscales, log signal variance sf2, log noise l.
+    constant, where the density of each sample is that of the policy fitted to all *other* samples.
+    It is the density of a commanded action, so its variance contains the noise l once, and not the
+    ``l / w_i`` of a sample.
+
+    The parameters are g log lengthscales, log signal variance sf2, log noise l.
 
     Attributes:
         distances: (g, m, m) squared distances of each factor at lengthscale one.
         targets: (m, da) commanded actions in units of the action scale.
-        weights: (m,) the w_i.
-        within: (m,) sum of the variances of what a target is the mean of: the expected density of
-            all of it takes the place of the density of one action.
+        weights: (m,) the w_i; ``p_i = w_i / sum w``.
+        target_variance: (m,) variance of the actions whose mean is a target, summed over
+            coordinates.  The loss is then the expected one over these actions.
     """
 
     distances: FloatArray
@@ -94,7 +114,7 @@ class PolicyLoss:
     target_variance: FloatArray | float = 0.0
 
     def __call__(self, x: FloatArray) -> tuple[float, FloatArray]:
-        """Value and gradient (g + 2,)."""
+        """Value and gradient (g + 2,) at parameters ``x`` (g + 2,)."""
         signal, noise = np.exp(x[-2:])
         share = self.weights / self.weights.sum()
         actions = self.targets.shape[1]
@@ -129,53 +149,53 @@ class PolicyLoss:
 
 @dataclass(frozen=True)
 class Prior:
-    """Independent Gaussians over log parameters, and the box they are searched in.
+    """Independent Gaussians over log parameters, and the box in which these are searched.
 
-    ``strength`` is what one unit of ``((x - centre) / spread)^2 / 2`` weighs against the loss.
+    Attributes:
+        centre: (k,) means.
+        std: (k,) standard deviations.
+        low, high: (k,) limits of the box.
+        strength: factor of ``sum ((x - centre) / std)^2 / 2`` beside the loss.
     """
 
     centre: FloatArray
-    spread: FloatArray
+    std: FloatArray
     low: FloatArray
     high: FloatArray
     strength: float
 
     def __call__(self, x: FloatArray) -> tuple[float, FloatArray]:
-        z = (x - self.centre) / self.spread
-        return 0.5 * self.strength * float(z @ z), self.strength * z / self.spread
+        """Value and gradient (k,) of the term that is added to the loss."""
+        z = (x - self.centre) / self.std
+        return 0.5 * self.strength * float(z @ z), self.strength * z / self.std
 
 
 def factor_distances(factors: tuple[Factor, ...], x: FloatArray) -> FloatArray:
-    """Squared distances (g, m, m) of each factor between rows of ``x`` (m, d)."""
-    return np.stack([squared_distances(factor, x) for factor in factors])
-
-
-TOLERANCE = 1e-3
-"""Gain of an iteration that ends a fit, as a share of the loss or, if that is below one, of one:
-the losses are logarithms, and some hundred samples do not tell less apart."""
+    """Squared distances (g, m, m) of g factors at lengthscale one, between inputs (m, d)."""
+    return np.stack([squared_distances(factor.coordinates(x)) for factor in factors])
 
 
 def minimise(
     loss: EmbeddingLoss | PolicyLoss,
     prior: Prior,
     *starts: FloatArray,
-    max_iterations: int = 30,
+    max_iterations: int = MAX_ITERATIONS,
 ) -> FloatArray:
-    """Parameters of least loss plus prior within the prior's box (L-BFGS-B).
+    """Parameters with the smallest loss plus prior within the prior's box (L-BFGS-B).
 
     Args:
         loss, prior: add up to what is minimised.
-        starts: one or more; the search begins at the best of them.  Where all samples are taken to
-            be unlike each other nothing is predicted and nothing improves, and a search that has
-            once come there would stay.
+        starts: one or more parameters (k,), which are clipped to the box.  The search begins at the
+            best of them.  Where lengthscales are so short that no sample predicts another, the
+            gradient of the loss vanishes; a search from there alone would not move.
         max_iterations: of the search.
     """
 
     def objective(x: Any) -> tuple[float, Any]:
         try:
             value, gradient = loss(x)
-        except NumericalError:  # a step too far: tell the line search so
-            return 1e10, np.zeros_like(x)
+        except NumericalError:
+            return REJECTED_LOSS, np.zeros_like(x)
         penalty, pull = prior(x)
         return value + penalty, gradient + pull
 
@@ -187,6 +207,6 @@ def minimise(
         jac=True,
         method="L-BFGS-B",
         bounds=list(zip(prior.low, prior.high, strict=True)),
-        options={"maxiter": max_iterations, "ftol": TOLERANCE},
+        options={"maxiter": max_iterations, "ftol": LOSS_TOLERANCE},
     )
     return np.asarray(found.x, dtype=np.float64)

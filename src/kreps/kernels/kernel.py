@@ -1,10 +1,10 @@
-"""Kernels as Gaussian kernels of an embedding.
+"""Product kernels: their factors, their lengthscales, and the median heuristic for these.
 
-Every kernel of the paper is ``k(x, y) = exp(-|e(x) - e(y)|^2 / 2)`` for some map ``e`` to
-Euclidean coordinates: a squared exponential has ``e(x) = x / l``, the periodic kernel
-``exp(-2 sin^2((x - y) / 2) / l^2)`` has ``e(x) = (cos x, sin x) / l``, and a product of kernels
-concatenates the embeddings.  So whoever adds a kernel writes one short method, and a Gram matrix
-is one thin matrix product and one exponential.
+Every kernel of the paper is ``k(x, y) = exp(-|e(x) - e(y)|^2 / 2)`` for some map e into Euclidean
+coordinates.  A squared exponential has ``e(x) = x / l``.  The periodic kernel
+``exp(-2 sin^2((x - y) / 2) / l^2)`` has ``e(x) = (cos x, sin x) / l``.  A product of kernels
+concatenates the embeddings.  So a new kernel is one class with a method `Factor.coordinates`, and
+a Gram matrix is one thin matrix product and one exponential.
 """
 
 from __future__ import annotations
@@ -16,10 +16,23 @@ from typing import Protocol
 
 import numpy as np
 
-from kreps.kernels.arrays import Array, FloatArray, IntArray, columns, like, namespace
-from kreps.kernels.gram import gaussian_gram
+from kreps.kernels.arrays import Array, FloatArray, columns, like, namespace
+from kreps.kernels.gram import gaussian_gram, squared_distances
 from kreps.kernels.linalg import principal_coordinates
-from kreps.kernels.pivoted_cholesky import PivotedCholesky, pivoted_cholesky
+
+IMAGE_BLUR = 0.3
+"""Standard deviation of the Gaussian smoothing of images, in units of their side.
+
+At this width the distances between smoothed images of a rod are nearly those of the chord between
+its tips, on which a periodic kernel of the rod's angle is based (docs/deviations.md).
+"""
+
+MEDIAN_SAMPLE_SIZE = 500
+"""Rows whose pairwise distances give a median lengthscale: 124,750 pairs, whose median hardly
+differs from that of all pairs, at a cost that does not grow with the data."""
+
+DUPLICATE_RTOL = 1e-12
+"""Pairs with a squared distance below this share of the largest are duplicates up to rounding."""
 
 
 class Factor(Protocol):
@@ -27,7 +40,7 @@ class Factor(Protocol):
 
     @property
     def dims(self) -> tuple[int, ...]:
-        """The columns of the input that it is over."""
+        """The columns of the input that the factor depends on."""
         ...
 
     def coordinates(self, x: Array) -> Array:
@@ -58,10 +71,15 @@ class Periodic:
 
 @dataclass(frozen=True)
 class WrapAngle:
-    """``exp(-|x - y|^2 / (2 l^2))`` of an angle by its number, from ``begin`` to a turn later.
+    """``exp(-|x - y|^2 / (2 l^2))`` of an angle's representation in ``[begin, begin + 2 pi)``.
 
-    Beside a periodic factor of the same angle it tells the two sides of the cut apart, where the
-    numbers begin anew, and hardly anything else.
+    The kernel is discontinuous where the angle wraps, at ``begin``.  Multiplied with a periodic
+    factor of the same angle, and with a lengthscale of the order of a turn, it lets a function
+    take different values on the two sides of the wrap and changes the kernel little elsewhere.
+
+    Attributes:
+        dims: the one column of the angle, in rad.
+        begin: where the angle wraps, in rad.
     """
 
     dims: tuple[int, ...]
@@ -71,16 +89,16 @@ class WrapAngle:
         return (columns(x, self.dims) - self.begin) % (2.0 * np.pi)
 
 
-IMAGE_BLUR = 0.3
-"""Standard deviation of the smoothing of images, in units of their side."""
-
-
 @dataclass(frozen=True)
 class SmoothedImage:
     """``exp(-|Gx - Gy|^2 / (2 l^2))`` over the pixels ``dims``, G a Gaussian smoothing.
 
-    Pixel by pixel, two sharp pictures of a thing differ as much when it has moved by twice its
-    width as when it has moved anywhere.  Smoothed pictures differ the more, the farther it moved.
+    Compared pixel by pixel, two sharp images of an object have the same distance after every move
+    larger than the object's width.  The distance of smoothed images grows with the move.
+
+    Attributes:
+        dims: columns of the pixels, row by row.
+        shape: height and width in pixels.
     """
 
     dims: tuple[int, ...]
@@ -95,9 +113,9 @@ class SmoothedImage:
 
 @cache
 def smoothing(size: int) -> FloatArray:
-    """A matrix (k, size), k <= size, that gives rows of pixels the distances of smoothed ones.
+    """A matrix A (k, size), k <= size, such that ``|A x - A y|`` is the distance of smoothed rows.
 
-    Smooth rows lie in few dimensions: only their coordinates there are kept.
+    Smoothed rows of pixels lie near a subspace of few dimensions; A gives coordinates in it.
     """
     i = np.arange(size) / (IMAGE_BLUR * size)
     return principal_coordinates(np.exp(-0.5 * (i[:, None] - i) ** 2))
@@ -111,8 +129,12 @@ def factors_of(
 ) -> tuple[Factor, ...]:
     """One factor per group of columns, and one per column that is in no group.
 
-    Columns named in ``periodic`` are periodic, the others squared exponential; groups are images
-    of ``image_shape``, row by row, if one is given.
+    Args:
+        dimension: number of columns.
+        periodic: columns with angles, in rad, which get a periodic factor.  All others get a
+            squared exponential.
+        groups: columns that share a lengthscale.
+        image_shape: height and width of images; then every group is one image, row by row.
     """
     if image_shape is not None:
         return tuple(SmoothedImage(tuple(group), image_shape) for group in groups)
@@ -127,7 +149,7 @@ def factors_of(
 
 
 def wrap_factors(angles: Sequence[int], begins: Sequence[float]) -> tuple[WrapAngle, ...]:
-    """One factor for each column of angles, cut where its numbers begin."""
+    """One `WrapAngle` for each column of ``angles``, which wraps at its entry of ``begins``."""
     return tuple(WrapAngle((i,), float(begin)) for i, begin in zip(angles, begins, strict=True))
 
 
@@ -137,7 +159,8 @@ class Kernel:
 
     Attributes:
         factors: g factors.
-        lengthscales: (g,) in the units of the columns; of the chord for periodic ones.
+        lengthscales: (g,) in the units of the columns; for periodic factors, of the chord
+            ``2 sin(|x - y| / 2)``.
     """
 
     factors: tuple[Factor, ...]
@@ -147,10 +170,11 @@ class Kernel:
         assert self.lengthscales.shape == (len(self.factors),)
 
     def with_lengthscales(self, lengthscales: FloatArray) -> Kernel:
+        """The same factors with other lengthscales (g,)."""
         return replace(self, lengthscales=lengthscales)
 
     def part(self, chosen: slice) -> Kernel:
-        """The product of some of the factors."""
+        """The product of the factors in a slice."""
         return Kernel(self.factors[chosen], self.lengthscales[chosen])
 
     def embed(self, x: Array) -> Array:
@@ -170,46 +194,29 @@ class Kernel:
         return gaussian_gram(self.embed(x), None if y is None else self.embed(y))
 
 
-def pivots_of(kernel: Kernel, x: FloatArray, *, tolerance: float, max_rank: int) -> PivotedCholesky:
-    """Pivoted Cholesky of the Gram matrix of inputs (n, d), which is never formed."""
-    e = kernel.embed(x)
-
-    def entries(rows: IntArray | None, across: IntArray) -> FloatArray:
-        if rows is across:  # symmetric, with ones on its diagonal
-            return gaussian_gram(e[across])
-        return gaussian_gram(e[across], e if rows is None else e[rows]).T
-
-    return pivoted_cholesky(np.ones(len(e)), entries, tolerance=tolerance, max_rank=max_rank)
-
-
-def squared_distances(factor: Factor, x: FloatArray) -> FloatArray:
-    """``D_g`` (n, n): squared distances of one factor at lengthscale one."""
-    c = factor.coordinates(x)
-    c = c - c.mean(axis=0)
-    norms = np.einsum("ij,ij->i", c, c)
-    d = norms[:, None] + norms - 2.0 * (c @ c.T)
-    np.maximum(d, 0.0, out=d)
-    np.fill_diagonal(d, 0.0)
-    return d
-
-
 def median_lengthscales(
     factors: Sequence[Factor],
     x: FloatArray,
     rng: np.random.Generator,
-    sample: int = 500,
+    sample_size: int = MEDIAN_SAMPLE_SIZE,
 ) -> FloatArray:
-    """Median distance of each factor (g,) between pairs of ``sample`` random rows of ``x`` (n, d).
+    """Median distance of each factor (g,) between pairs of at most ``sample_size`` random rows.
 
-    Pairs at distance zero are left out (duplicates say nothing about scale); a factor in which
-    all rows agree gets lengthscale 1, which is then without effect.
+    Pairs at distance zero are left out, because duplicates carry no information about the scale.
+    A factor in which all rows agree gets lengthscale 1, which then has no effect.
+
+    Args:
+        factors: g factors.
+        x: (n, d) inputs.
+        rng: draws the rows.
+        sample_size: number of rows.
     """
-    if len(x) > sample:
-        x = x[rng.choice(len(x), sample, replace=False)]
+    if len(x) > sample_size:
+        x = x[rng.choice(len(x), sample_size, replace=False)]
     above = np.triu_indices(len(x), 1)
     scales = []
     for factor in factors:
-        d = squared_distances(factor, x)[above]
-        d = d[d > 1e-12 * d.max(initial=0.0)]
+        d = squared_distances(factor.coordinates(x))[above]
+        d = d[d > DUPLICATE_RTOL * d.max(initial=0.0)]
         scales.append(np.sqrt(np.median(d)) if len(d) else 1.0)
     return np.array(scales)

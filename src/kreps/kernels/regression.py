@@ -1,14 +1,13 @@
-"""Eq. 4: the conditional embedding of the transition model, and its sample-based special case.
+"""Conditional embeddings (Eq. 4) and other kernel regressions on states and actions.
 
-Both answer one question: given the features of the observed successors, what are the *expected*
-features of the successor of each sampled state and action?
+An embedding maps the features of observed successors to the *expected* features of the successor of
+any state and action.  The same machinery regresses changes of state and rewards.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -18,23 +17,29 @@ from kreps.kernels.gram import gaussian_gram
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.linalg import Cholesky, cholesky, solve_lower, with_diagonal
 
-ROWS = 2048
-"""Inputs predicted at once: their Gram matrix with all samples would be the largest array."""
+PREDICTION_BATCH = 2048
+"""Inputs predicted at once.  It bounds the memory of their Gram matrix with all samples, which
+would be the largest array of an update."""
 
+MAX_RESIDUAL_RATIO = 1e-4
+"""Largest kernel residual of a sample in `PivotedEmbedding`, as a share of the regulariser.
 
-class TransitionModel(Protocol):
-    def expected_features(self, successor_features: Array) -> Array:
-        """``E[phi(s') | s_i, a_i]``, (n, r), from the observed ``phi(s'_i)``, (n, r)."""
-        ...
+A sample's residual acts like an addition to its regulariser.  At this ratio the sum over all
+samples is typically below a hundredth of the regulariser.
+"""
+
+MIN_LEVERAGE_GAP = 1e-12
+"""Smallest value of one minus the leverage of a sample, by which leave-one-out errors divide.
+Rounding could make it zero or negative."""
 
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """How far a model is wrong, judged at each sample by what all others say of it.
+    """Leave-one-out errors of a regression.
 
     Attributes:
-        targets: (n, r) what was to be predicted.
-        errors: (n, r) targets less their predictions from the other samples.
+        targets: (n, r) observed targets.
+        errors: (n, r) targets less their predictions from all other samples.
     """
 
     targets: FloatArray
@@ -70,6 +75,11 @@ class KernelEmbedding:
 
     @classmethod
     def fit(cls, kernel: Kernel, inputs: Array, regulariser: float) -> KernelEmbedding:
+        """The embedding of samples at inputs (n, ds + da), at a cost of n^3.
+
+        Raises:
+            NumericalError: ``K_sa + lambda I`` cannot be factorised.
+        """
         gram = kernel.gram(inputs)
         return cls(kernel, inputs, regulariser, cholesky(with_diagonal(gram, regulariser)))
 
@@ -78,44 +88,47 @@ class KernelEmbedding:
         return self.factor.solve(self.kernel.gram(self.inputs, inputs))
 
     def expected_features(self, successor_features: Array) -> Array:
-        """``K_sa (K_sa + lambda I)^-1 F'``, (n, r), without forming beta for all pairs.
+        """``K_sa (K_sa + lambda I)^-1 F'``, (n, r), for the observed features F' (n, r).
 
-        By ``K = (K + lambda I) - lambda I`` this is ``F' - lambda (K_sa + lambda I)^-1 F'``.
+        By ``K = (K + lambda I) - lambda I`` this is ``F' - lambda (K_sa + lambda I)^-1 F'``, which
+        needs neither K nor beta for all pairs.  A jitter of the factorisation adds to lambda.
         """
         added = self.regulariser + self.factor.jitter
         return successor_features - added * self.factor.solve(successor_features)
 
-    def predictor(self, targets: FloatArray) -> Callable[[FloatArray], FloatArray]:
-        """What is expected of targets (n, r) as a function of inputs (m, ds + da)."""
+    def predictor(
+        self, targets: FloatArray, batch_size: int = PREDICTION_BATCH
+    ) -> Callable[[FloatArray], FloatArray]:
+        """The expectation of targets (n, r) as a function of inputs (m, ds + da).
+
+        Args:
+            targets: (n, r) at the samples.
+            batch_size: number of inputs that are predicted at once.
+        """
         solved = self.factor.solve(targets)
         known = self.kernel.embed(self.inputs)
 
         def predict(inputs: FloatArray) -> FloatArray:
             expected = np.empty((len(inputs), *solved.shape[1:]))
-            for first in range(0, len(inputs), ROWS):
-                block = slice(first, first + ROWS)
-                expected[block] = gaussian_gram(self.kernel.embed(inputs[block]), known) @ solved
+            for first in range(0, len(inputs), batch_size):
+                batch = slice(first, first + batch_size)
+                expected[batch] = gaussian_gram(self.kernel.embed(inputs[batch]), known) @ solved
             return expected
 
         return predict
 
     def leave_one_out(self, targets: FloatArray) -> LeaveOneOut:
-        """In closed form, of targets (n, r): ``[C^-1 F']_i / [C^-1]_ii``."""
+        """Errors of targets F' (n, r): ``[C^-1 F']_i / [C^-1]_ii`` with ``C = K_sa + lambda I``."""
         inverse = self.factor.inverse()
         return LeaveOneOut(targets, inverse @ targets / np.diagonal(inverse)[:, None])
 
 
-NEGLIGIBLE = 1e-4
-"""Part of its regulariser by which a regression may miss the kernel of a sample with itself: what
-is left out in all is then typically below a hundredth of it."""
-
-
 @dataclass(frozen=True)
 class PivotedEmbedding:
-    """`KernelEmbedding` in features of a few pivots, which leave next to nothing of its kernel out.
+    """`KernelEmbedding` in the features of r pivots, at a cost of n r^2 instead of n^3.
 
-    What is left out of the diagonal of ``K_sa`` is below `NEGLIGIBLE` lambda, so hardly anything
-    that the regulariser lets through is lost, at a cost of n r^2 instead of n^3.
+    The pivots leave a residual below `MAX_RESIDUAL_RATIO` lambda on the diagonal of ``K_sa``.
+    Directions in which the kernel is smaller are suppressed by the regulariser anyway.
 
     Attributes:
         basis: r features psi of states and applied actions.
@@ -131,8 +144,14 @@ class PivotedEmbedding:
 
     @classmethod
     def fit(cls, kernel: Kernel, inputs: FloatArray, regulariser: float) -> PivotedEmbedding | None:
-        """None where half as many pivots as samples do not suffice, and nothing would be saved."""
-        tolerance = NEGLIGIBLE * regulariser
+        """The embedding of samples at inputs (n, ds + da).
+
+        None if more than n / 2 pivots would be needed, which would save little.
+
+        Raises:
+            NumericalError: ``Psi'Psi + lambda I`` cannot be factorised.
+        """
+        tolerance = MAX_RESIDUAL_RATIO * regulariser
         basis, features = RKHSBasis.fit(
             kernel, inputs, tolerance=tolerance, max_rank=len(inputs) // 2
         )
@@ -142,17 +161,20 @@ class PivotedEmbedding:
         return cls(basis, features, regulariser, factor)
 
     def predictor(self, targets: FloatArray) -> Callable[[FloatArray], FloatArray]:
-        """What is expected of targets (n, r) as a function of inputs (m, ds + da)."""
+        """The expectation of targets (n, r) as a function of inputs (m, ds + da)."""
         return self.basis.function(self.factor.solve(self.features.T @ targets))
 
     def leave_one_out(self, targets: FloatArray) -> LeaveOneOut:
-        """In closed form, of targets (n, r)."""
+        """Errors of targets (n, r) in closed form."""
         return feature_leave_one_out(self.factor, self.features, targets)
 
 
 @dataclass(frozen=True)
 class SampleModel:
-    """The single observed successor stands for the expectation: ``ksa = identity`` in Eq. 4."""
+    """The sample-based model: each observed successor in place of the expectation.
+
+    It is Eq. 4 with ``k_sa(i, j) = 1`` if i = j, else 0, and lambda = 0.
+    """
 
     def expected_features(self, successor_features: Array) -> Array:
         return successor_features
@@ -160,19 +182,24 @@ class SampleModel:
 
 @dataclass(frozen=True)
 class RegressionSums:
-    """What samples say of features as linear functions of features; sums over chunks add up.
+    """Sums over samples that determine a linear regression; those of chunks add up.
 
     Attributes:
-        gram: (q, q) ``Psi'Psi``.
-        product: (q, r) ``Psi'F'``.
+        gram: (q, q) ``Psi'Psi`` of the regressors psi.
+        product: (q, r) ``Psi'F'`` of regressors and targets.
     """
 
     gram: FloatArray
     product: FloatArray
 
     @classmethod
-    def of(cls, psi: Array, targets: Array) -> RegressionSums:
-        """Of features (n, q) of states and actions and their targets (n, r)."""
+    def from_samples(cls, psi: Array, targets: Array) -> RegressionSums:
+        """Sums over n samples.
+
+        Args:
+            psi: (n, q) features of states and actions.
+            targets: (n, r).
+        """
         return cls(as_numpy(psi.T @ psi), as_numpy(psi.T @ targets))
 
     def __add__(self, other: RegressionSums) -> RegressionSums:
@@ -183,12 +210,12 @@ class RegressionSums:
 class FeatureRegression:
     """Eq. 4 in q features psi of states and actions: ``mu(s, a) = coefficients' psi(s, a)``.
 
-    With ``coefficients = (Psi'Psi + lambda I)^-1 Psi'F'`` it is the embedding of the kernel
-    ``psi'psi`` at a cost of n q^2 instead of n^3.
+    With ``coefficients = (Psi'Psi + lambda I)^-1 Psi'F'`` it is the embedding with the kernel
+    ``psi'psi``, at a cost of n q^2 instead of n^3.
 
     Attributes:
         mean: mu (n, r) as a function of states and applied actions (n, ds + da).
-        jitter: of the factorisation.
+        jitter: of the factorisation of ``Psi'Psi + lambda I``.
     """
 
     mean: Callable[[Array], Array]
@@ -196,29 +223,42 @@ class FeatureRegression:
 
     @classmethod
     def fit(cls, basis: Basis, sums: RegressionSums, regulariser: float) -> FeatureRegression:
+        """The regression of samples with these sums.
+
+        Raises:
+            NumericalError: ``Psi'Psi + lambda I`` cannot be factorised.
+        """
         factor = cholesky(with_diagonal(sums.gram, regulariser))
         return cls(basis.function(factor.solve(sums.product)), factor.jitter)
 
     @staticmethod
     def leave_one_out(
-        psi: FloatArray,
-        targets: FloatArray,
-        regulariser: float,
-        stands_for: float = 1.0,
+        psi: FloatArray, targets: FloatArray, regulariser: float, multiplicity: float = 1.0
     ) -> LeaveOneOut:
-        """That of a regression of targets (n, r) on features psi (n, q), in closed form.
+        """Errors in closed form of a regression of targets (n, r) on features psi (n, q).
 
-        Where these are a part of the samples, each ``stands_for`` as many of them.
+        Args:
+            psi, targets: a subsample.
+            regulariser: lambda.
+            multiplicity: number of samples that each row of the subsample stands for.
         """
-        factor = cholesky(with_diagonal(stands_for * (psi.T @ psi), regulariser))
-        return feature_leave_one_out(factor, psi, targets, stands_for)
+        factor = cholesky(with_diagonal(multiplicity * (psi.T @ psi), regulariser))
+        return feature_leave_one_out(factor, psi, targets, multiplicity)
 
 
 def feature_leave_one_out(
-    factor: Cholesky, psi: FloatArray, targets: FloatArray, stands_for: float = 1.0
+    factor: Cholesky, psi: FloatArray, targets: FloatArray, multiplicity: float = 1.0
 ) -> LeaveOneOut:
-    """That of targets (n, r) on features psi (n, q), by the factor of ``Psi'Psi + lambda I``."""
-    residuals = targets - psi @ factor.solve(stands_for * (psi.T @ targets))
+    """Errors of targets (n, r) when one of the ``multiplicity`` copies of a row is left out.
+
+    Args:
+        factor: of ``multiplicity Psi'Psi + lambda I``.
+        psi: (n, q) features.
+        targets: (n, r).
+        multiplicity: number of samples that each row stands for.
+    """
+    residuals = targets - psi @ factor.solve(multiplicity * (psi.T @ targets))
     whitened = solve_lower(factor.lower, psi.T)
-    leverage = np.minimum(np.einsum("ij,ij->j", whitened, whitened), 1.0 - 1e-12)
+    leverage = np.einsum("ij,ij->j", whitened, whitened)
+    leverage = np.minimum(leverage, 1.0 - MIN_LEVERAGE_GAP)
     return LeaveOneOut(targets, residuals / (1.0 - leverage)[:, None])

@@ -1,7 +1,7 @@
-"""BLAS threads, set on purpose.
+"""The number of threads that BLAS uses.
 
-At the sizes of an update (n ~ 1500) a second thread gains little, and beside a busy neighbour it
-waits on spinning partners and can cost ten times the time.
+At the sizes of an update (n about 1500) a second thread gains little.  On a machine with other busy
+processes, threads wait for each other in spin locks, which can multiply the time by ten.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 
 
 def blas_threads(count: int | None) -> AbstractContextManager[object]:
-    """Within this context BLAS uses ``count`` threads; None leaves it as it is."""
+    """A context in which BLAS uses ``count`` threads; None leaves the number as it is."""
     if count is None:
         return nullcontext()
     return threadpool_limits(limits=count, user_api="blas")

@@ -29,7 +29,7 @@ from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import Array, FloatArray, IntArray, columns, like
 from kreps.kernels.basis import Basis
 from kreps.kernels.kernel import Kernel
-from kreps.kernels.regression import ROWS, LeaveOneOut
+from kreps.kernels.regression import PREDICTION_BATCH, LeaveOneOut
 from kreps.models.transition import fit_regression, state_actions
 
 
@@ -175,8 +175,8 @@ class Dynamics:
             inputs: (m, ds + da) states and scaled, applied actions.
         """
         expected = np.empty((len(rows), len(start)))
-        for first in range(0, len(rows), ROWS):
-            block = slice(first, first + ROWS)
+        for first in range(0, len(rows), PREDICTION_BATCH):
+            block = slice(first, first + PREDICTION_BATCH)
             successors, ends = self.predict(inputs[block])
             residuals = self.residuals[rows[block]]
             spread = 0.5 * basis.features(successors + residuals)

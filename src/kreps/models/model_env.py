@@ -17,7 +17,7 @@ import numpy as np
 from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
-from kreps.kernels.gram import PANEL
+from kreps.kernels.gram import BLOCK_ENTRIES
 from kreps.kernels.kernel import Kernel
 from kreps.models.dynamics import SAMPLES_PER_COEFFICIENT, Dynamics
 from kreps.policies.base import StochasticPolicy
@@ -245,7 +245,7 @@ class ModelEnv:
         mean, samples = self._samples
         embedded = self.kernel.embed(states) - mean
         extended = np.concatenate([embedded, np.ones((len(embedded), 1))], axis=1)
-        height = max(1, PANEL // samples.shape[1])  # few enough that products stay in the cache
+        height = max(1, BLOCK_ENTRIES // samples.shape[1])  # so that products stay in the cache
         rows = np.concatenate(
             [
                 np.argmax(extended[i : i + height] @ samples, axis=1)

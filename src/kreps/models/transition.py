@@ -134,7 +134,7 @@ def embedding_hyperparameters(
     typical = np.log(np.append(state_kernel.lengthscales, for_actions))
     prior = Prior(
         centre=np.append(typical, np.log(1e-3)),
-        spread=np.append(np.ones(len(factors)), 3.0),
+        std=np.append(np.ones(len(factors)), 3.0),
         low=np.append(typical - 3.0, np.log(1e-6)),
         high=np.append(typical + 3.0, 0.0),
         # the loss is twice minus the log density of one Gaussian error whose variance is fitted

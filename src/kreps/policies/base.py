@@ -1,4 +1,4 @@
-"""Stochastic policies: the cost-sensitive Gaussian process (CrKR, Sec. 2) and first explorers."""
+"""The interfaces of policies."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class StochasticPolicy(Protocol):
 
 
 class LearntPolicy(StochasticPolicy, Protocol):
-    """A policy that can also be followed without its exploration."""
+    """A policy that also has actions without exploration."""
 
     @property
     def task(self) -> TaskSpec: ...

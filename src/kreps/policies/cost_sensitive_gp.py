@@ -1,4 +1,4 @@
-"""Stochastic policies: the cost-sensitive Gaussian process (CrKR, Sec. 2) and first explorers."""
+"""The cost-sensitive Gaussian process policy (CrKR, Sec. 2) with all samples as support points."""
 
 from __future__ import annotations
 
@@ -16,15 +16,17 @@ from kreps.kernels.linalg import Cholesky, cholesky, inverse_lower
 from kreps.policies.sparse_gp import PolicySums, SparseGP
 
 MAX_SUPPORT = 6_000
-"""Most support points of an exact policy: it costs their square in memory, their cube in time."""
+"""Largest number of support points of an exact policy.  Memory grows with its square (288 MB for
+one matrix), time with its cube."""
 
-PIVOT_TOLERANCE = 1e-12
-"""Squared residual of a support point's kernel function that in no case needs another centre."""
+MIN_RESIDUAL = 1e-12
+"""Squared kernel residual of a support point below which it never becomes another centre.  Smaller
+residuals are dominated by rounding."""
 
-NEGLIGIBLE = 1e-4
-"""Part of its noise by which a policy may miss the prior variance of a support point.  On learnt
-policies its mean is then off by less than a hundredth of the noise's deviation, root mean square,
-and its own deviation by a thousandth."""
+MAX_RESIDUAL_RATIO = 1e-4
+"""Largest part of a support point's prior variance that the centres may leave out, as a share of
+its noise.  On learnt policies the mean then changes by less than a hundredth of the noise's
+standard deviation (root mean square), and the standard deviation by a thousandth."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,8 @@ class CostSensitiveGP:
         states: (m, ds) support points.
         targets: (m, da) their actions U, in units of the action scale around the centre.
         weights: (m,) their weights w > 0.
-        signal: sf2.
-        noise: l.
+        signal: signal variance sf2.
+        noise: noise variance l.
 
     Raises:
         ConfigurationError: more than `MAX_SUPPORT` support points.
@@ -59,14 +61,14 @@ class CostSensitiveGP:
     def __post_init__(self) -> None:
         if len(self.weights) > MAX_SUPPORT:
             raise ConfigurationError(
-                f"the policy would have {len(self.weights)} support points, the limit is "
-                f"{MAX_SUPPORT}; keep fewer roll-outs by a smaller window"
+                f"the policy would have {len(self.weights)} support points, but at most "
+                f"{MAX_SUPPORT} are possible; set a smaller window, or low_rank=kreps.LowRank()"
             )
-        _ = self.predictor  # now, not in the first control cycle
+        _ = self.predictor  # here, so that the first control cycle is as fast as the others
 
     @cached_property
     def factor(self) -> Cholesky:
-        """Of C."""
+        """Cholesky factor of C."""
         c = self.signal * self.kernel.gram(self.states)
         c.flat[:: len(c) + 1] += self.noise / self.weights
         return cholesky(c)
@@ -78,23 +80,21 @@ class CostSensitiveGP:
 
     @cached_property
     def predictor(self) -> SparseGP:
-        """The same process as the control loop evaluates it, with few centres where these suffice.
+        """The process as the control loop evaluates it, projected on few centres where possible.
 
-        Kernels of smooth policies are nearly linear functions of each other.  The pivots r << m of
-        a Cholesky factorisation are chosen until what they leave of any support point's kernel is
-        below `NEGLIGIBLE` of its least noise and of itself.  A control cycle then costs r^2 instead
-        of m^2, and to fit it m r^2 instead of m^3.  Where half of the support points do not
-        suffice, all are centres.
+        Pivots r << m of a Cholesky factorisation are added until the kernel residual of every
+        support point is below `MAX_RESIDUAL_RATIO` of the smallest noise ``l / (sf2 max w)``, and
+        of one.  A control cycle then costs r^2 instead of m^2, and the fit m r^2 instead of m^3.
+        If more than m / 2 pivots would be needed, all support points are centres.
         """
-        with np.errstate(all="ignore"):  # of extreme numbers, which the other bounds then serve
-            least_noise = np.float64(self.noise) / self.signal / self.weights.max()
-        tolerance = float(np.clip(NEGLIGIBLE * least_noise, PIVOT_TOLERANCE, NEGLIGIBLE))
+        with np.errstate(all="ignore"):  # extreme numbers are clipped in the next line but one
+            smallest_noise = np.float64(self.noise) / self.signal / self.weights.max()
+        tolerance = np.clip(MAX_RESIDUAL_RATIO * smallest_noise, MIN_RESIDUAL, MAX_RESIDUAL_RATIO)
         basis, features = RKHSBasis.fit(
-            self.kernel, self.states, tolerance=tolerance, max_rank=len(self.states) // 2
+            self.kernel, self.states, tolerance=float(tolerance), max_rank=len(self.states) // 2
         )
         if basis.residual <= tolerance:
-            sums = PolicySums.of(features, self.weights, self.targets)
-            return SparseGP.fit(self.task, basis, sums, self.signal, self.noise)
+            return self._projected(basis, features)
         return SparseGP(
             self.task,
             self.kernel,
@@ -105,9 +105,14 @@ class CostSensitiveGP:
             self.noise,
         )
 
+    def _projected(self, basis: RKHSBasis, features: FloatArray) -> SparseGP:
+        """The process projected on a basis, given the features (m, r) of the support points."""
+        sums = PolicySums.from_samples(features, self.weights, self.targets)
+        return SparseGP.fit(self.task, basis, sums, self.signal, self.noise)
+
     @property
     def jitter(self) -> float:
-        """What the factorisation of C needed, if it was needed itself."""
+        """Jitter of the factorisation of C; zero if the predictor does not need it."""
         return self.factor.jitter if len(self.predictor.states) == len(self.states) else 0.0
 
     def mean(self, states: FloatArray) -> FloatArray:
@@ -125,9 +130,9 @@ class CostSensitiveGP:
         return self.predictor.act(states, noise)
 
     def compressed(self, centres: int) -> SparseGP:
-        """This policy on at most ``centres`` support points, for small computers.
+        """This policy on at most ``centres`` support points, for computers with little memory.
 
-        All samples still count: it is the posterior of the projected process, whose variance far
+        All samples still enter: it is the posterior of the projected process, whose variance far
         from the centres is that of the prior.
 
         Raises:
@@ -136,12 +141,6 @@ class CostSensitiveGP:
         if centres < 1:
             raise ConfigurationError(f"centres = {centres}, but a policy needs at least one")
         basis, features = RKHSBasis.fit(
-            self.kernel, self.states, tolerance=PIVOT_TOLERANCE, max_rank=centres
+            self.kernel, self.states, tolerance=MIN_RESIDUAL, max_rank=centres
         )
-        return SparseGP.fit(
-            self.task,
-            basis,
-            PolicySums.of(features, self.weights, self.targets),
-            self.signal,
-            self.noise,
-        )
+        return self._projected(basis, features)

@@ -1,9 +1,9 @@
-"""What a learner explores with before there is a policy, for how long, and what it remembers of it.
+"""First policies, and temporally correlated exploration noise.
 
-White noise averages out: what one step pushes the next one takes back, and a task whose states
-change slowly is never seen to change.  Noise with a power spectrum of ``1 / f^beta`` has slow parts
-as well: pink noise, beta = 1, as much in every octave, so that it needs no time scale (Eberhard et
-al. 2023 explore with it by default); red noise, beta = 2, is the random walk that goes farthest.
+White noise averages out: each push is undone by later ones, and the states of a slow system hardly
+change.  Noise with a power spectrum of ``1 / f^beta`` also has slow components.  Pink noise, with
+beta = 1, has the same power in every octave and so needs no time scale (Eberhard et al. 2023).  Red
+noise, with beta = 2, is a random walk and moves the states farthest.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 
 WHITE, PINK, RED = 0.0, 1.0, 2.0
-"""Exponents beta of the spectrum."""
+"""Exponents beta of power spectra ``1 / f^beta``."""
 
 
 def coloured_noise(
@@ -24,7 +24,15 @@ def coloured_noise(
 ) -> FloatArray:
     """Standard normal numbers (length, width), each column with a spectrum of ``1 / f^exponent``.
 
-    They are the first half of a period, so that the last ones are no neighbours of the first.
+    White noise is filtered in the frequency domain (Timmer and Koenig 1995).  That makes it
+    periodic; twice the length is generated and half of it returned, so that the last numbers are
+    not correlated with the first.
+
+    Args:
+        exponent: beta, for example `WHITE`, `PINK` or `RED`.
+        length: number of steps.
+        width: number of action coordinates.
+        rng: draws the white noise.
     """
     if exponent == WHITE:
         return rng.standard_normal((length, width))
@@ -39,7 +47,10 @@ def coloured_noise(
 
 @dataclass(frozen=True)
 class BangBang:
-    """Each action at one of its limits, with random sign: what bounded control often is."""
+    """Each action at one of its limits, chosen by the sign of the noise, whatever the state.
+
+    Time-optimal control of bounded actions is often of this kind.
+    """
 
     task: TaskSpec
 
@@ -49,10 +60,15 @@ class BangBang:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """Actions ``N(centre, (spread * scale)^2)``, whatever the state."""
+    """Actions ``N(centre, (scale * action_scale)^2)``, whatever the state.
+
+    Attributes:
+        task: gives centre and scale of the actions.
+        scale: standard deviation, in units of the action scale.
+    """
 
     task: TaskSpec
-    spread: float
+    scale: float
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
-        return self.task.action_centre + self.spread * self.task.action_scale * noise
+        return self.task.action_centre + self.scale * self.task.action_scale * noise

@@ -1,8 +1,8 @@
-"""A Gaussian process policy carried by few centres: what the control loop evaluates.
+"""A Gaussian process policy on few centres, which the control loop evaluates.
 
-It comes about in three ways: from an exact process, with all centres that its noise lets one tell
-apart (`CostSensitiveGP.predictor`) or so many (`CostSensitiveGP.compressed`), or from sums over any
-number of samples.
+It is made from an exact process, with as many centres as its noise requires
+(`CostSensitiveGP.predictor`) or with a given number (`CostSensitiveGP.compressed`), or from sums
+over any number of samples (`SparseGP.fit`).
 """
 
 from __future__ import annotations
@@ -18,36 +18,46 @@ from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.linalg import solve_lower_transposed
 
-ROWS = 128
-"""Of a triangular matrix that are multiplied at once."""
+TRIANGULAR_BLOCK_ROWS = 128
+"""Rows of a triangular matrix that are multiplied at once, without the zeros to their right."""
 
 
 @dataclass(frozen=True)
 class PolicySums:
-    """What weighted samples say about actions as a linear function of features z, (r,).
+    """Weighted sums over samples that determine a policy linear in features z, (r,).
+
+    Those of chunks add up.
 
     Attributes:
         precision: (r, r), ``sum_i w_i z_i z_i'``.
-        pull: (r, da), ``sum_i w_i z_i u_i'``.
+        weighted_targets: (r, da), ``sum_i w_i z_i u_i'``.
     """
 
     precision: FloatArray
-    pull: FloatArray
+    weighted_targets: FloatArray
 
     @classmethod
-    def of(cls, features: Array, weights: Array, targets: Array) -> PolicySums:
-        """Of features (n, r), weights (n,) and scaled actions (n, da), of any array library."""
+    def from_samples(cls, features: Array, weights: Array, targets: Array) -> PolicySums:
+        """Sums over n samples, of any array library.
+
+        Args:
+            features: (n, r) z.
+            weights: (n,) w.
+            targets: (n, da) actions u around their centre, in units of the action scale.
+        """
         root = namespace(features).sqrt(weights)[:, None]
         weighted = root * features
         return cls(as_numpy(weighted.T @ weighted), as_numpy(weighted.T @ (root * targets)))
 
     def __add__(self, other: PolicySums) -> PolicySums:
-        return PolicySums(self.precision + other.precision, self.pull + other.pull)
+        return PolicySums(
+            self.precision + other.precision, self.weighted_targets + other.weighted_targets
+        )
 
 
 @dataclass(frozen=True)
 class SparseGP:
-    """Mean and variance of actions from the kernel values ``k`` of a state with r centres only.
+    """Mean and variance of actions from the kernel values ``k`` of a state with r centres.
 
     Attributes:
         task: gives centre, scale and limits of the actions.
@@ -55,7 +65,7 @@ class SparseGP:
         states: (r, ds) the centres.
         mean_weights: (r, da), the scaled mean is ``k' mean_weights``.
         explained: (r, r), the explained variance is ``|explained k|^2``.
-        signal, noise: sf2 and l.
+        signal, noise: variances sf2 and l.
     """
 
     task: TaskSpec
@@ -75,12 +85,12 @@ class SparseGP:
         With features ``z(s)`` of the basis and ``P = I + (sf2 / l) sum_i w_i z_i z_i'``:
         ``mu(s) = (sf2 / l) z(s)' P^-1 sum_i w_i z_i u_i`` and
         ``sigma^2(s) = sf2 (1 - z(s)' z(s)) + sf2 z(s)' P^-1 z(s) + l``.
-        The first part of the variance is what the centres cannot represent; without it (subset
-        of regressors) the policy would grow sure of itself far from all data.
+        The first part of the variance is what the centres cannot represent.  Without it (subset of
+        regressors) the variance would vanish far from all data.
         """
         values, vectors = np.linalg.eigh(signal / noise * sums.precision)
         values = np.maximum(values, 0.0)
-        mean = vectors @ ((vectors.T @ sums.pull) / (1.0 + values)[:, None])
+        mean = vectors @ ((vectors.T @ sums.weighted_targets) / (1.0 + values)[:, None])
         # I - P^-1 = vectors diag(values / (1 + values)) vectors'
         explained = np.sqrt(signal * values / (1.0 + values)) * vectors
         return cls(
@@ -93,13 +103,16 @@ class SparseGP:
             noise,
         )
 
-    def deflated(self, times: float) -> SparseGP:
-        """With a deviation so many times smaller, of process and noise alike: the mean stays."""
+    def deflated(self, std_scale: float) -> SparseGP:
+        """The same mean with the standard deviation divided by ``std_scale``.
+
+        Standard deviations of process and noise are divided alike.
+        """
         return replace(
             self,
-            explained=self.explained / times,
-            signal=self.signal / times**2,
-            noise=self.noise / times**2,
+            explained=self.explained / std_scale,
+            signal=self.signal / std_scale**2,
+            noise=self.noise / std_scale**2,
         )
 
     @cached_property
@@ -115,13 +128,14 @@ class SparseGP:
         return origin, centred, 0.5 * np.sum(centred * centred, axis=1)
 
     @cached_property
-    def _explained_rows(self) -> list[FloatArray]:
-        """`explained` in pieces, of which a triangular one has fewer columns: half the work."""
-        triangular = len(self.explained) > ROWS and not np.triu(self.explained, 1).any()
+    def _explained_blocks(self) -> list[FloatArray]:
+        """Blocks of rows of `explained`; of a triangular matrix without the zeros on the right."""
+        rows = TRIANGULAR_BLOCK_ROWS
+        triangular = len(self.explained) > rows and not np.triu(self.explained, 1).any()
         if not triangular:
             return [self.explained]
-        starts = range(0, len(self.explained), ROWS)
-        return [self.explained[i : i + ROWS, : i + ROWS] for i in starts]
+        starts = range(0, len(self.explained), rows)
+        return [self.explained[i : i + rows, : i + rows] for i in starts]
 
     def greedy(self, states: FloatArray) -> FloatArray:
         """Mean action (m, da) at states (m, ds), in the task's units, not clipped."""
@@ -138,8 +152,8 @@ class SparseGP:
     def _covariances(self, states: FloatArray) -> FloatArray:
         """Kernel values (r, m) of the centres with states (m, ds).
 
-        As `gaussian_gram` of both, but what depends on the centres alone is not computed again
-        in each cycle.
+        They are those of `gaussian_gram`.  What depends on the centres alone is computed once, and
+        not in each control cycle.
         """
         origin, centred, half_squares = self._centred
         f = self.kernel.embed(states) - origin
@@ -154,7 +168,7 @@ class SparseGP:
 
     def _deviation(self, k: FloatArray) -> FloatArray:
         variance = np.full(k.shape[1], self.signal)
-        for rows in self._explained_rows:
-            explained = rows @ k[: rows.shape[1]]
+        for block in self._explained_blocks:
+            explained = block @ k[: block.shape[1]]
             variance -= np.einsum("ij,ij->j", explained, explained)
         return np.sqrt(np.maximum(variance, 0.0) + self.noise)

@@ -1,4 +1,4 @@
-"""Policies that act on values: softmax over Q (value iteration), maximising sample (NPALP)."""
+"""Policies that act on values: softmax over Q (value iteration), maximum over samples (NPALP)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from kreps.kernels.arrays import FloatArray, IntArray
 from kreps.kernels.gram import gaussian_gram
 from kreps.kernels.kernel import Kernel
 
-CHUNK = 2048
-"""States that are served at once: bounds the memory of a large batch."""
+STATE_BATCH = 2048
+"""States that are evaluated at once: bounds the memory of a large batch."""
 
 
-def _chunks(states: FloatArray) -> list[FloatArray]:
-    """At least one, even of no states."""
-    return [states[i : i + CHUNK] for i in range(0, max(len(states), 1), CHUNK)]
+def _batches(states: FloatArray) -> list[FloatArray]:
+    """Batches of at most `STATE_BATCH` states; one empty batch if there are no states."""
+    return [states[i : i + STATE_BATCH] for i in range(0, max(len(states), 1), STATE_BATCH)]
 
 
 @dataclass(frozen=True)
 class SoftmaxPolicy:
-    """Chooses among candidate actions with probability proportional to ``exp(Q / temperature)``.
+    """Draws a candidate action with probability proportional to ``exp(Q / temperature)``.
 
     ``Q(s, a_k) = offset + sum_i k_s(s_i, s) table_ik`` for samples i and candidates k.
 
@@ -32,10 +32,10 @@ class SoftmaxPolicy:
         task: gives centre, scale and limits of the actions.
         kernel: over states.
         states: (n, ds) sampled states.
-        table: (n, k).
-        offset: constant part of Q; all values are in units of the reward.
+        table: (n, k) weights, in units of the reward.
+        offset: constant part of Q, in units of the reward.
         candidates: (k, da) actions, in units of the action scale around the centre.
-        temperature: zero for the maximum.
+        temperature: in units of the reward; zero for the maximum.
     """
 
     task: TaskSpec
@@ -52,7 +52,7 @@ class SoftmaxPolicy:
 
     def q_values(self, states: FloatArray) -> FloatArray:
         """Q (m, k) at states (m, ds)."""
-        grams = (gaussian_gram(self._coordinates, self.kernel.embed(s)) for s in _chunks(states))
+        grams = (gaussian_gram(self._coordinates, self.kernel.embed(s)) for s in _batches(states))
         return np.concatenate([k.T @ self.table + self.offset for k in grams])
 
     def value(self, states: FloatArray) -> FloatArray:
@@ -63,7 +63,8 @@ class SoftmaxPolicy:
         if self.temperature == 0.0:
             return self.greedy(states)
         probabilities = softmax(self.q_values(states) / self.temperature, axis=1)
-        # one draw from each row by inverting its distribution function
+        # one draw per state: the noise becomes a uniform number, which inverts the cumulated
+        # probabilities
         uniform = ndtr(noise[:, :1])
         chosen = (np.cumsum(probabilities, axis=1) < uniform).sum(axis=1)
         return self._actions(np.minimum(chosen, len(self.candidates) - 1))
@@ -85,10 +86,11 @@ def soft_maximum(q: FloatArray, temperature: float) -> FloatArray:
 
 @dataclass(frozen=True)
 class LipschitzPolicy:
-    """Takes the action of the sample that gives a state its value, with occasional noise.
+    """Takes the action of the sample whose bound on a state's value is largest.
 
-    ``V(s) = max_i (q_i - slope |e(s) - e(s_i)|)``: the least function of that slope on which all
-    samples agree (Pazis and Parr 2011).
+    ``V(s) = max_i (q_i - slope |e(s) - e(s_i)|)`` is the smallest function with this Lipschitz
+    constant that satisfies the bounds of all samples (Pazis and Parr 2011).  A share of the actions
+    gets Gaussian noise.
 
     Attributes:
         task: gives centre, scale and limits of the actions.
@@ -98,7 +100,7 @@ class LipschitzPolicy:
         bounds: (n,) the q_i, in units of the reward.
         slope: Lipschitz constant, reward per unit of distance.
         noise_fraction: share of the actions that gets Gaussian noise.
-        noise_scale: its standard deviation, in units of the action scale.
+        noise_scale: standard deviation of this noise, in units of the action scale.
     """
 
     task: TaskSpec
@@ -115,22 +117,22 @@ class LipschitzPolicy:
         return self.kernel.embed(self.states)
 
     def _bounds_at(self, states: FloatArray) -> FloatArray:
-        """(m, n): what each sample says of each state."""
-        from scipy.spatial.distance import cdist  # 0.1 s that other methods need not wait
+        """``q_i - slope |e(s) - e(s_i)|``, (m, n), of m states and n samples."""
+        from scipy.spatial.distance import cdist  # loaded here, as it takes 0.1 s
 
         return self.bounds - self.slope * cdist(self.kernel.embed(states), self._coordinates)
 
     def value(self, states: FloatArray) -> FloatArray:
         """V (m,) at states (m, ds)."""
-        return np.concatenate([self._bounds_at(s).max(axis=1) for s in _chunks(states)])
+        return np.concatenate([self._bounds_at(s).max(axis=1) for s in _batches(states)])
 
     def greedy(self, states: FloatArray) -> FloatArray:
-        chosen = [self._bounds_at(s).argmax(axis=1) for s in _chunks(states)]
+        chosen = [self._bounds_at(s).argmax(axis=1) for s in _batches(states)]
         return self.actions[np.concatenate(chosen)]
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
-        # One normal number both decides whether there is noise and, stretched back to a whole
-        # distribution, is its first coordinate.
+        # The first normal number decides whether there is noise.  If so, its rank among those that
+        # do is a uniform number, which becomes the normal noise of the first coordinate.
         uniform = ndtr(noise[:, 0])
         noisy = uniform < self.noise_fraction
         added = np.where(noisy[:, None], noise, 0.0)
