@@ -18,7 +18,7 @@ import kreps
 from kreps.algorithms.dual import Moments
 from kreps.algorithms.report import UpdateInfo
 from kreps.data.compute import Compute
-from kreps.data.dataset import Dataset, RolloutChunk
+from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.errors import NumericalError
@@ -63,7 +63,7 @@ def is_strict(array: Array) -> bool:
 
 
 def assert_agree(found: Array, wanted: FloatArray, tolerance: float = 1e-12) -> None:
-    """That ``found`` is still where it was computed, and has the same numbers to rounding."""
+    """That ``found`` is on the strict device, with the numbers of ``wanted`` to rounding."""
     assert is_strict(found)
     assert found.dtype == array_api_strict.float64
     scale = np.abs(wanted).max()
@@ -77,7 +77,7 @@ def normal(*shape: int, seed: int = 0) -> FloatArray:
 # ---- conversions ------------------------------------------------------------------------------
 
 
-def test_the_strict_library_refuses_what_these_tests_rely_on_it_to_refuse() -> None:
+def test_the_strict_library_does_not_mix_arrays() -> None:
     with pytest.raises((TypeError, ValueError)):
         strict(np.ones(2)) + np.ones(2)
     with pytest.raises((TypeError, ValueError)):
@@ -131,7 +131,7 @@ def test_factors_have_the_same_coordinates(factor: Factor) -> None:
     assert_agree(kernel.embed(strict(x)), kernel.embed(x))
 
 
-def test_gram_matrices_agree_and_have_a_diagonal_of_ones() -> None:
+def test_gram_matrices_agree_and_have_a_diagonal_of_one() -> None:
     x, y = normal(20, 2), normal(7, 2, seed=1)
     assert_agree(gaussian_gram(strict(x), strict(y)), gaussian_gram(x, y))
     found = gaussian_gram(strict(x))
@@ -142,7 +142,7 @@ def test_gram_matrices_agree_and_have_a_diagonal_of_ones() -> None:
     assert as_numpy(gaussian_gram(wide)).max() <= 1.0
 
 
-def test_the_arguments_of_a_gram_matrix_are_left_alone() -> None:
+def test_the_arguments_of_a_gram_matrix_are_not_changed() -> None:
     x = normal(5, 2)
     there = strict(x)
     KERNEL.gram(there)
@@ -161,7 +161,7 @@ def test_cholesky_factors_and_their_solutions_agree() -> None:
             assert_agree(solve(there.lower, strict(b)), solve(here.lower, b), 1e-10)
 
 
-def test_what_is_added_to_a_diagonal_goes_to_a_copy() -> None:
+def test_adding_to_a_diagonal_makes_a_copy() -> None:
     a = normal(4, 4)
     there = strict(a)
     assert_agree(with_diagonal(there, 0.5), a + 0.5 * np.eye(4))
@@ -183,7 +183,7 @@ def test_the_same_jitter_is_added_and_reported(eigenvalue: float) -> None:
     ids=["indefinite", "zero", "nan", "infinite"],
 )
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_what_cannot_be_factorised_raises(a: FloatArray) -> None:
+def test_a_matrix_that_cannot_be_factorised_raises(a: FloatArray) -> None:
     with pytest.raises(NumericalError):
         cholesky(strict(a))
 
@@ -242,7 +242,7 @@ def test_moments_agree_and_are_numpys(scatter: bool, eta: float) -> None:
         assert there.scatter is None
 
 
-def test_sums_agree_and_are_numpys() -> None:
+def test_sums_agree_and_are_numpy_arrays() -> None:
     psi, targets, weights = normal(40, 6), normal(40, 3, seed=1), np.abs(normal(40, seed=2))
     here = RegressionSums.from_samples(psi, targets)
     there = RegressionSums.from_samples(strict(psi), strict(targets))
@@ -292,9 +292,9 @@ def updated(
     task: TaskSpec = TASK,
     **settings: Any,
 ) -> tuple[kreps.KREPS, UpdateInfo]:
-    """An update of low rank with one chunk for each rollout, so that the dual is streamed too."""
+    """An update of low rank from chunks of about 100 steps, so that the dual is streamed too."""
     learner = kreps.KREPS(task, compute=Compute(to_device=to_device), **settings)
-    info = learner.update(Dataset(tuple(RolloutChunk((rollout,)) for rollout in rollouts)))
+    info = learner.update(Dataset.from_rollouts(rollouts, chunk_size=100))
     assert isinstance(info, UpdateInfo)
     return learner, info
 
@@ -305,7 +305,7 @@ def assert_same_update(
     states: FloatArray,
 ) -> None:
     """Weights and V to rounding; the policy as far as the choice of its pivots permits."""
-    # Measured: up to 4e-7 (of the smallest weights) and 2e-8, as bases of so many features are
+    # Measured: up to 4e-7 (of the smallest weights) and 2e-8, as bases of 60 to 300 features are
     # ill-conditioned.
     weights, wanted_weights = found[1].dual.weights, wanted[1].dual.weights
     np.testing.assert_allclose(weights, wanted_weights, rtol=2e-6, atol=1e-14)

@@ -1,4 +1,4 @@
-"""What is explored with before the reward tells of the states: coloured noise, and for how long."""
+"""Exploration until the reward depends on the state, and which rollouts are remembered."""
 
 from __future__ import annotations
 
@@ -14,50 +14,8 @@ from kreps.data.rewards import all_rollouts_informative, is_informative, reward_
 from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow, append, newest
-from kreps.policies.exploration import PINK, RED, WHITE, coloured_noise
 
 TASK = TaskSpec(2, np.array([-2.0, -1.0]), np.array([2.0, 1.0]))
-
-
-@pytest.mark.parametrize("exponent", [PINK, RED])
-def test_coloured_noise_is_standard_normal(exponent: float) -> None:
-    rng = np.random.default_rng(0)
-    draws = np.stack([coloured_noise(exponent, 40, 2, rng) for _ in range(4000)])
-    assert draws.shape == (4000, 40, 2)
-    np.testing.assert_allclose(draws.mean(axis=0), 0.0, atol=0.08)
-    np.testing.assert_allclose(draws.std(axis=0), 1.0, atol=0.06)
-    tails = np.mean(np.abs(draws) > 1.96)
-    assert tails == pytest.approx(0.05, abs=0.005)
-    assert abs(np.mean(draws[..., 0] * draws[..., 1])) < 0.02
-
-
-@pytest.mark.parametrize("exponent", [PINK, RED])
-def test_its_spectrum_falls_as_it_should(exponent: float) -> None:
-    rng = np.random.default_rng(1)
-    length = 256
-    draws = np.stack([coloured_noise(exponent, length, 1, rng)[:, 0] for _ in range(3000)])
-    windowed = draws * np.hanning(length)  # the first and the last of a roll-out do not meet
-    power = np.mean(np.abs(np.fft.rfft(windowed, axis=1)) ** 2, axis=0)
-    k = np.array([8, 16, 32, 64])
-    slope = np.polyfit(np.log(k), np.log(power[k]), 1)[0]
-    assert slope == pytest.approx(-exponent, abs=0.1)
-
-
-def test_the_end_of_a_roll_out_is_no_neighbour_of_its_beginning() -> None:
-    rng = np.random.default_rng(2)
-    draws = np.stack([coloured_noise(RED, 50, 1, rng)[:, 0] for _ in range(4000)])
-    assert np.mean(draws[:, 0] * draws[:, 1]) > 0.9
-    assert np.mean(draws[:, 0] * draws[:, -1]) < 0.0  # half a period away
-
-
-def test_white_noise_is_what_the_generator_draws() -> None:
-    found = coloured_noise(WHITE, 7, 3, np.random.default_rng(3))
-    rng = np.random.default_rng(3)
-    np.testing.assert_array_equal(found, np.stack([rng.standard_normal(3) for _ in range(7)]))
-
-
-def test_a_single_step_has_noise_too() -> None:
-    assert np.isfinite(coloured_noise(PINK, 1, 2, np.random.default_rng(4))).all()
 
 
 def rollout(reward: Any, seed: int = 0, steps: int = 30) -> Rollout:

@@ -35,7 +35,6 @@ from kreps.kernels.basis import Basis, RKHSBasis
 from kreps.kernels.hyperparameters import Prior, minimise
 from kreps.kernels.kernel import Kernel, SquaredExponential
 from kreps.kernels.regression import FeatureRegression, KernelEmbedding, LeaveOneOut, RegressionSums
-from kreps.kernels.sampling import systematic_resampling
 from kreps.models import transition as transition_model
 from kreps.models.dynamics import DeltaStateTargets
 from kreps.models.transition import (
@@ -80,44 +79,6 @@ def updated(
     info = learner.update(given)
     assert isinstance(info, UpdateInfo)
     return learner, info
-
-
-# ---- which states -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("count", [1, 7, 40, 1000])
-@pytest.mark.parametrize("seed", range(5))
-def test_states_are_drawn_as_often_as_their_weights_say(seed: int, count: int) -> None:
-    rng = np.random.default_rng(seed)
-    p = np.exp(3.0 * rng.normal(size=30))
-    p[rng.uniform(size=30) < 0.3] = 0.0
-    p /= p.sum()
-    rows = systematic_resampling(p, count, rng)
-    assert len(rows) == count
-    assert (np.diff(rows) >= 0).all()
-    split_budget = np.bincount(rows, minlength=30)
-    assert (split_budget >= np.floor(count * p - 1e-9)).all()
-    assert (split_budget <= np.ceil(count * p + 1e-9)).all()
-    assert not split_budget[p == 0.0].any()
-
-
-def test_the_draw_of_states_is_unbiased() -> None:
-    rng = np.random.default_rng(0)
-    p = np.array([0.5, 0.03, 0.17, 0.3])
-    split_budget = sum(
-        np.bincount(systematic_resampling(p, 7, rng), minlength=4) for _ in range(4000)
-    )
-    # each count is one of two neighbours: a standard deviation of at most one half
-    np.testing.assert_allclose(split_budget / 4000.0, 7.0 * p, atol=5 * 0.5 / np.sqrt(4000.0))
-
-
-def test_weights_need_not_add_up_to_one() -> None:
-    p = np.array([0.1, 0.2, 0.3])
-    one, other = (
-        systematic_resampling(scale * p, 60, np.random.default_rng(1)) for scale in (1.0, 1e-3)
-    )
-    np.testing.assert_array_equal(one, other)
-    np.testing.assert_array_equal(np.bincount(one), [10, 20, 30])
 
 
 # ---- what the model says of them --------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What the hyper-parameters of a regression are fitted to: rows that tell, and what they weigh."""
+"""The fit of a regression's hyper-parameters: its subsample, weights, prior and starts."""
 
 from __future__ import annotations
 
@@ -9,12 +9,7 @@ from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.hyperparameters import EmbeddingLoss, Prior
-from kreps.kernels.sampling import (
-    FIT_SAMPLE_SIZE,
-    effective_target_count,
-    inclusion_probabilities,
-    pps_subsample,
-)
+from kreps.kernels.sampling import effective_target_count, pps_subsample
 from kreps.models import transition as transition_model
 from kreps.models.transition import (
     embedding_hyperparameters,
@@ -24,60 +19,6 @@ from kreps.models.transition import (
 )
 
 TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
-
-
-def heavy_tailed(n: int = 1500) -> FloatArray:
-    return np.random.default_rng(0).standard_normal(n) ** 6
-
-
-def test_few_rows_are_all_taken() -> None:
-    rows, weights = pps_subsample(heavy_tailed(FIT_SAMPLE_SIZE), np.random.default_rng(0))
-    np.testing.assert_array_equal(rows, np.arange(FIT_SAMPLE_SIZE))
-    np.testing.assert_array_equal(weights, 1.0)
-
-
-@pytest.mark.parametrize("squares", [heavy_tailed(), np.ones(777), np.zeros(777)])
-def test_sums_over_the_rows_are_those_of_all_on_average(squares: FloatArray) -> None:
-    summed = np.cos(np.arange(len(squares))) ** 2 + squares
-    found = []
-    for seed in range(400):
-        rows, weights = pps_subsample(squares, np.random.default_rng(seed))
-        assert len(np.unique(rows)) == len(rows) and abs(len(rows) - FIT_SAMPLE_SIZE) <= 1
-        found.append(weights @ summed[rows])
-    error = np.std(found) / np.sqrt(len(found))
-    assert np.mean(found) == pytest.approx(summed.sum(), abs=4.0 * error + 1e-9)
-
-
-def test_rare_rows_are_never_missed() -> None:
-    squares = np.full(1500, 1e-4)
-    rare = np.array([3, 700, 1499])
-    squares[rare] = 100.0
-    for seed in range(20):
-        rows, weights = pps_subsample(squares, np.random.default_rng(seed))
-        assert np.isin(rare, rows).all()
-        np.testing.assert_array_equal(weights[np.isin(rows, rare)], 1.0)
-
-
-@pytest.mark.parametrize("count", [1, 10, 99])
-def test_no_chance_is_above_one_and_the_others_keep_their_proportion(count: int) -> None:
-    share = np.random.default_rng(1).exponential(size=100) ** 3
-    share /= share.sum()
-    chance = inclusion_probabilities(share, count)
-    assert chance.sum() == pytest.approx(count)
-    assert chance.max() <= 1.0
-    free = chance < 1.0
-    np.testing.assert_allclose(chance[free] / share[free], (chance[free] / share[free])[0])
-    assert not free.all() or count < 1.0 / share.max()
-
-
-def test_the_evidence_is_the_number_of_rows_that_have_something_to_tell() -> None:
-    squares = np.array([4.0, 4.0, 4.0, 0.0, 0.0])
-    assert effective_target_count(squares, np.ones(5)) == pytest.approx(3.0)
-    assert effective_target_count(squares, np.array([2.0, 2.0, 2.0, 1.0, 9.0])) == pytest.approx(
-        6.0
-    )
-    assert effective_target_count(1e-200 * squares, np.ones(5)) == pytest.approx(3.0)
-    assert effective_target_count(np.zeros(5), np.full(5, 2.0)) == pytest.approx(10.0)
 
 
 @pytest.mark.parametrize("start", [None, np.array([0.3, -0.2, 0.1, -2.0])])
