@@ -38,7 +38,7 @@ from kreps.experiments.trials import (
     trial_of,
     write_trial,
 )
-from kreps.learning.learner import LEARNERS
+from kreps.learning.methods import LEARNERS
 from kreps.presets import flat
 
 TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}

@@ -22,7 +22,8 @@ from kreps.algorithms.generated import MAX_GENERATED
 from kreps.experiments.search import CANDIDATES
 from kreps.experiments.specs import FIGURES, METHODS
 from kreps.kernels.kernel import IMAGE_BLUR
-from kreps.learning.learner import LEARNERS, IterationReport, Learner
+from kreps.learning.learner import IterationReport, Learner
+from kreps.learning.methods import LEARNERS
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 from kreps.settings import PRESETS, Settings
 

@@ -15,14 +15,8 @@ from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError, StorageError
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.evaluate import Greedy, evaluate
-from kreps.learning.learner import (
-    KREPS,
-    LEARNERS,
-    NPALP,
-    GridValueIteration,
-    Learner,
-    ValueIteration,
-)
+from kreps.learning.learner import Learner
+from kreps.learning.methods import KREPS, LEARNERS, NPALP, GridValueIteration, ValueIteration
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.exploration import BangBang, Gaussian
 

@@ -28,7 +28,8 @@ from kreps.data.task import TaskSpec
 from kreps.errors import StorageError
 from kreps.kernels.kernel import Kernel
 from kreps.learning import storage
-from kreps.learning.learner import LEARNERS, Learner
+from kreps.learning.learner import Learner
+from kreps.learning.methods import LEARNERS
 from kreps.learning.storage import POLICIES_OF_METHOD
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 from kreps.policies.sparse_gp import SparseGP

@@ -467,7 +467,7 @@ def grid_of(
     iteration: int = 0,
 ) -> list[Rollout]:
     return collect_grid(
-        env, task_of(env), ranges, states, actions, most=most, seed=seed, iteration=iteration
+        env, task_of(env), ranges, states, actions, max_points=most, seed=seed, iteration=iteration
     )
 
 

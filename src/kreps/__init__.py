@@ -27,13 +27,8 @@ if TYPE_CHECKING:
     from kreps.data.rollouts import Rollout, Rollouts
     from kreps.data.task import TaskSpec
     from kreps.envs.restart import RandomRestart
-    from kreps.learning.learner import (
-        KREPS,
-        NPALP,
-        GridValueIteration,
-        IterationReport,
-        ValueIteration,
-    )
+    from kreps.learning.learner import IterationReport
+    from kreps.learning.methods import KREPS, NPALP, GridValueIteration, ValueIteration
     from kreps.learning.policy import Policy, load_policy
     from kreps.learning.storage import load_rollouts, rollout_folder, save_rollouts
     from kreps.presets import PRESETS
@@ -77,10 +72,10 @@ __version__ = "0.1.0"
 # SciPy and the learner are loaded when first asked for: importing kreps to have its environments
 # registered should cost little more than importing Gymnasium.
 _HOMES = {
-    "KREPS": "learning.learner",
-    "ValueIteration": "learning.learner",
-    "GridValueIteration": "learning.learner",
-    "NPALP": "learning.learner",
+    "KREPS": "learning.methods",
+    "ValueIteration": "learning.methods",
+    "GridValueIteration": "learning.methods",
+    "NPALP": "learning.methods",
     "IterationReport": "learning.learner",
     "Policy": "learning.policy",
     "load_policy": "learning.policy",

@@ -1,29 +1,29 @@
-"""The library's errors: one small tree, so that ``except kreps.KrepsError`` catches them all.
+"""The errors of the library, all derived from `KrepsError`.
 
-Every message names the value that was met, the limit it broke and the remedy.
+Messages name the value found, the limit that it violates, and the remedy.
 """
 
 from __future__ import annotations
 
 
 class KrepsError(Exception):
-    """Base class of every error that kreps raises on purpose."""
+    """Base class of all errors that kreps raises."""
 
 
 class ConfigurationError(KrepsError, ValueError):
-    """A parameter, or a combination of parameters, that cannot be served."""
+    """An invalid parameter or combination of parameters."""
 
 
 class SpaceError(ConfigurationError):
-    """An observation or action space that cannot be served."""
+    """An observation or action space that is not supported."""
 
 
 class DataError(KrepsError, ValueError):
-    """Roll-outs that cannot be learnt from: wrong shapes, NaN, infinities, nothing in them."""
+    """Invalid data: wrong types or shapes, NaN, infinities, no rollout or no step."""
 
 
 class EnvironmentFailure(KrepsError, RuntimeError):
-    """The environment raised during a roll-out; what was learnt before is untouched."""
+    """The environment raised an exception; the learner is as after the last update."""
 
 
 class TrialFailure(KrepsError, RuntimeError):
@@ -35,4 +35,4 @@ class NumericalError(KrepsError, ArithmeticError):
 
 
 class StorageError(KrepsError, OSError):
-    """A file that is missing, damaged, foreign or of an unknown version."""
+    """A file is missing, damaged, of another program or kind, or of an unknown version."""

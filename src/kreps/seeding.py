@@ -1,7 +1,7 @@
-"""The only place where randomness is derived.
+"""Random generators, all derived here from the seed.
 
-A draw is addressed by ``(seed, purpose, *indices)``, never by the order in which code happens to
-run.  So a resumed run needs no stored generator state: it derives the same generators again.
+A generator is addressed by ``(seed, purpose, *indices)`` and does not depend on the order of calls.
+So a checkpoint needs no generator state: a resumed run derives the same generators again.
 """
 
 from __future__ import annotations
@@ -12,7 +12,10 @@ import numpy as np
 
 
 class Purpose(IntEnum):
-    """What a generator is for.  The numbers are part of the file format: never renumber."""
+    """What a generator is used for.
+
+    A resumed run needs the same numbers, so they must never change.
+    """
 
     ENVIRONMENT = 0
     POLICY = 1
@@ -29,10 +32,10 @@ def _sequence(seed: int, purpose: Purpose, indices: tuple[int, ...]) -> np.rando
 
 
 def generator(seed: int, purpose: Purpose, *indices: int) -> np.random.Generator:
-    """The generator of one purpose: ``generator(seed, Purpose.POLICY, iteration, rollout)``."""
+    """The generator of an address: ``generator(seed, Purpose.POLICY, iteration, rollout)``."""
     return np.random.Generator(np.random.PCG64(_sequence(seed, purpose, indices)))
 
 
 def integer_seed(seed: int, purpose: Purpose, *indices: int) -> int:
-    """A 32-bit seed for an interface that takes one, such as ``gymnasium.Env.reset``."""
+    """The 32-bit seed of an address, for interfaces such as ``gymnasium.Env.reset``."""
     return int(_sequence(seed, purpose, indices).generate_state(1)[0])

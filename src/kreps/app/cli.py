@@ -34,7 +34,7 @@ from kreps.experiments.specs import EXTRA_EXPERIMENTS, FIGURES, FIRST_SEED, PICT
 from kreps.experiments.trials import name_of
 from kreps.learning.environment import Environment
 from kreps.learning.evaluate import EPISODES, STEPS
-from kreps.learning.learner import KREPS
+from kreps.learning.methods import KREPS
 from kreps.learning.policy import load_policy, mean_difference
 from kreps.presets import settings_of
 

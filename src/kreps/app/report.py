@@ -21,7 +21,7 @@ from kreps.errors import ConfigurationError, EnvironmentFailure
 from kreps.kernels.threads import blas_threads
 from kreps.learning.environment import Environment, batch_model_of
 from kreps.learning.evaluate import EPISODES, STEPS, Evaluation, evaluate, stochastic_and_greedy
-from kreps.learning.learner import KREPS
+from kreps.learning.methods import KREPS
 from kreps.learning.policy import Policy
 from kreps.learning.storage import write_atomically
 from kreps.settings import LearnerSettings

@@ -20,7 +20,8 @@ from typing import Any
 
 from kreps.algorithms.dual import Outcome
 from kreps.errors import ConfigurationError, StorageError
-from kreps.learning.learner import KREPS, IterationReport
+from kreps.learning.learner import IterationReport
+from kreps.learning.methods import KREPS
 from kreps.learning.progress import seconds_by_stage
 from kreps.learning.storage import save_policy, write_atomically
 from kreps.settings import RKHS, Settings

@@ -10,7 +10,7 @@ from typing import Any, overload
 
 import numpy as np
 
-from kreps.data.task import LARGEST, TaskSpec, is_sane
+from kreps.data.task import MAX_MAGNITUDE, TaskSpec, is_sane
 from kreps.errors import DataError
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
 
@@ -369,7 +369,7 @@ class Transitions:
         )
 
 
-_INVALID = f"{{}} hold NaN, an infinity or a number beyond {LARGEST:g}, first in"
+_INVALID = f"{{}} hold NaN, an infinity or a number beyond {MAX_MAGNITUDE:g}, first in"
 _DROP = "drop the rollout, or cut it before that step"
 
 

@@ -1,4 +1,4 @@
-"""What is learnt from: the task's shape, roll-outs, the window kept of them, its transitions."""
+"""The specification of a task: sizes and limits of observations and actions."""
 
 from __future__ import annotations
 
@@ -11,30 +11,34 @@ from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import BoolArray, FloatArray
 from kreps.kernels.kernel import Factor, factors_of
 
-LONGEST_SIDE = 1024
-"""Of an image, in pixels: smoothing costs its square in memory, its cube in time."""
+MAX_IMAGE_SIDE = 1024
+"""Pixels per side of an image: smoothing costs their square in memory and their cube in time."""
 
-LARGEST = 1e100
-"""Numbers beyond this are no data: their squares would overflow."""
+MAX_MAGNITUDE = 1e100
+"""Larger numbers are not accepted as data: products of some of them would overflow."""
 
 
 def is_sane(values: FloatArray) -> BoolArray:
-    """Which ``values`` are neither NaN nor infinite nor absurdly large."""
-    return np.abs(values) <= LARGEST
+    """Which ``values`` are neither NaN nor infinite nor beyond `MAX_MAGNITUDE`."""
+    return np.abs(values) <= MAX_MAGNITUDE
 
 
 @dataclass(frozen=True, eq=False)
 class TaskSpec:
-    """What the learner must know of a task; everything else it learns.
+    """What is given of a task; dynamics and rewards are learnt from samples.
 
     Attributes:
-        observation_size: number of coordinates of an observation.
+        observation_size: number of coordinates ds of an observation.
         action_low, action_high: (da,) finite limits of the actions, in the task's units.
         periodic: the observation coordinates that are angles in rad (period 2 pi).
-        groups: observation coordinates that share a lengthscale, such as the pixels of an image;
-            a coordinate in no group has its own.
+        groups: observation coordinates that share a lengthscale, such as the pixels of an image.
+            A coordinate in no group has its own lengthscale.
         image_shape: (height, width) if the groups are images, each row by row from the top; then
-            every coordinate belongs to one.
+            every coordinate must belong to an image.
+
+    Raises:
+        ConfigurationError: sizes, limits or coordinates that are impossible or contradict each
+            other.
     """
 
     observation_size: int
@@ -70,28 +74,31 @@ class TaskSpec:
             )
         if not (is_sane(low).all() and is_sane(high).all() and (low < high).all()):
             raise ConfigurationError(
-                f"action limits {low} to {high} must be finite and low < high; "
-                "the policy needs a scale for its actions, so give a bounded range"
+                f"action limits {low} to {high} must be finite and low < high, as their range is "
+                "the scale of the actions; give a bounded range"
             )
         grouped = [i for group in self.groups for i in group]
         if len(set(grouped)) < len(grouped):
-            raise ConfigurationError("a coordinate is in two groups; it has one lengthscale")
+            raise ConfigurationError(
+                "a coordinate is in two groups, but can have only one lengthscale; leave it out of "
+                "one of them"
+            )
         angles = set(self.periodic)
         mixed = [g for g in self.groups if 0 < len(angles.intersection(g)) < len(g)]
         if mixed:
             raise ConfigurationError(
-                f"the group {mixed[0]!s:.60} mixes angles and other coordinates, which share "
-                "no scale"
+                f"the group {mixed[0]!s:.60} mixes angles and other coordinates, which cannot "
+                "share a lengthscale; make a group of each"
             )
         if self.image_shape is not None:
             try:
                 height, width = (operator.index(size) for size in self.image_shape)
             except (TypeError, ValueError):
                 height, width = 0, 0
-            if not (1 <= height <= LONGEST_SIDE and 1 <= width <= LONGEST_SIDE):
+            if not (1 <= height <= MAX_IMAGE_SIDE and 1 <= width <= MAX_IMAGE_SIDE):
                 raise ConfigurationError(
                     f"image_shape = {self.image_shape!r:.60}, but (height, width) is needed, two "
-                    f"whole numbers from 1 to {LONGEST_SIDE}"
+                    f"whole numbers from 1 to {MAX_IMAGE_SIDE}"
                 )
             object.__setattr__(self, "image_shape", (height, width))
             if {len(group) for group in self.groups} != {height * width} or (
@@ -106,7 +113,7 @@ class TaskSpec:
         outside = [i for i in named if not 0 <= i < self.observation_size]
         if outside:
             raise ConfigurationError(
-                f"periodic or grouped coordinates {outside!s:.60} do not exist: observations have "
+                f"periodic or grouped coordinates {outside!s:.60} do not exist; observations have "
                 f"{self.observation_size} coordinates, numbered from 0"
             )
 
@@ -117,15 +124,17 @@ class TaskSpec:
 
     @property
     def factor_count(self) -> int:
-        """How many lengthscales that are, counted without making them (a file may lie)."""
+        """Number of `state_factors`, without making them: in a damaged file it may be huge."""
         return self.observation_size - sum(len(group) - 1 for group in self.groups)
 
     @property
     def action_size(self) -> int:
+        """Number of coordinates da of an action."""
         return len(self.action_low)
 
     @property
     def action_centre(self) -> FloatArray:
+        """Middle of the range (da,)."""
         return 0.5 * (self.action_low + self.action_high)
 
     @property
@@ -134,15 +143,15 @@ class TaskSpec:
         return 0.5 * (self.action_high - self.action_low)
 
     def scaled(self, actions: FloatArray) -> FloatArray:
-        """Actions (m, da) around their centre, in units of the action scale."""
+        """Actions (m, da) relative to the centre, in units of the action scale."""
         return (actions - self.action_centre) / self.action_scale
 
     def unscaled(self, actions: FloatArray) -> FloatArray:
-        """Scaled actions (m, da) in the task's units."""
+        """Scaled actions (m, da) converted to the task's units."""
         return self.action_centre + self.action_scale * actions
 
     def clip(self, actions: FloatArray) -> FloatArray:
-        """The *applied* actions: what the actuators make of the commanded ones."""
+        """The *applied* actions: the commanded ones, clipped to their limits."""
         return np.clip(actions, self.action_low, self.action_high)
 
     def scaled_applied(self, actions: FloatArray) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The tasks of the paper as Gymnasium environments, and the wrapper that restarts any of them."""
+"""The tasks of the paper as Gymnasium environments, and a wrapper for random restarts."""
 
 from kreps.envs.restart import RandomRestart
 

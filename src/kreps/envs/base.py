@@ -1,4 +1,4 @@
-"""A Gymnasium environment made from a batch model: one row of it, one step at a time."""
+"""Gymnasium environments that are simulated by a batch model with a single row."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ from kreps.kernels.arrays import FloatArray, as_float
 
 
 class BatchEnvironment(gym.Env[FloatArray, FloatArray]):
-    """Steps its class's ``batch_model``; a subclass adds the spaces and `picture`."""
+    """An environment whose dynamics are those of its ``batch_model``.
+
+    A subclass sets ``batch_model``, the spaces and `picture`.
+    """
 
     batch_model: ClassVar[BatchModel]
 
@@ -45,7 +48,7 @@ class BatchEnvironment(gym.Env[FloatArray, FloatArray]):
         return self.picture(self._states[0]) if self.render_mode == "rgb_array" else None
 
     def picture(self, state: FloatArray) -> NDArray[np.uint8]:
-        """The picture (height, width, 3) of a state (k,)."""
+        """The rendered picture (height, width, 3), values 0 to 255, of a state (k,)."""
         raise NotImplementedError
 
     def _observe(self) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The vectorised form of a task: many independent roll-outs advanced by one call."""
+"""The vectorised form of an environment, which simulates many rollouts at once."""
 
 from __future__ import annotations
 
@@ -11,12 +11,11 @@ from kreps.kernels.arrays import BoolArray, FloatArray
 
 
 class BatchModel(Protocol):
-    """m copies of a task in lock step, each with its own generator.
+    """m independent copies of an environment, each with its own random generator.
 
-    An environment that offers one as its attribute ``batch_model`` is simulated in batches.  It
-    must draw from the generators exactly what the environment draws from its own, so that both
-    forms give the same trajectories from the same seeds.  States are the simulator's own; the
-    learner sees only what `observe` makes of them.
+    An environment with an attribute ``batch_model`` is simulated by it.  For each copy it must draw
+    the same random numbers as the environment, so that both give the same rollouts from the same
+    seeds.  States are internal to the simulator; only observations are learnt from.
     """
 
     def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
@@ -30,13 +29,13 @@ class BatchModel(Protocol):
     def step(
         self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Successors (m, k), rewards (m,) and ends (m,) for actions (m, da)."""
+        """Successors (m, k), rewards (m,) and whether the task ended (m,), for actions (m, da)."""
         ...
 
 
 class SettableModel(BatchModel, Protocol):
-    """A simulator that can be started anywhere, which robots and most environments cannot."""
+    """A batch model that can be set to any state."""
 
     def states_at(self, observations: FloatArray) -> FloatArray:
-        """States (m, k) that are observed as ``observations`` (m, ds)."""
+        """The states (m, k) with these observations (m, ds)."""
         ...

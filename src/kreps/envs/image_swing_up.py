@@ -1,4 +1,4 @@
-"""The swing-up seen through a camera (Sec. 4.5): 800 pixel values, no angle and no velocity."""
+"""The swing-up observed as images (Sec. 4.5): 800 pixel values, neither angle nor velocity."""
 
 from __future__ import annotations
 
@@ -31,10 +31,9 @@ def image(theta: FloatArray) -> FloatArray:
 
 
 class ImageSwingUpBatch:
-    """The swing-up for m roll-outs at once, observed as images.
+    """The swing-up for m rollouts at once, observed as images.
 
-    States are angle, velocity and the angle one step earlier, which only the difference image
-    needs; they never leave this class.
+    States (m, 3) are angle, velocity, and the angle one step earlier for the difference image.
     """
 
     _dynamics = SwingUpBatch()
@@ -58,12 +57,12 @@ class ImageSwingUp(BatchEnvironment):
     """
     ## Description
 
-    The task of `kreps/SwingUp-v0`, seen only through a camera of 20 x 20 pixels: the observation is
-    the current image and its difference to the previous one, 800 numbers.  Dynamics, noise,
-    rewards and starting state are those of `kreps/SwingUp-v0`.
+    The task of `kreps/SwingUp-v0`, observed by a camera of 20 x 20 pixels: the observation is the
+    current image and its difference to the previous one, 800 numbers.  Dynamics, noise, rewards
+    and starting state are those of `kreps/SwingUp-v0`.
 
-    The camera looks at a field of [-1.2, 1.2]^2 m with a rod of length 1 m in it.  A pixel has the
-    value `exp(-d^2 / (2 * 0.3^2))`, where `d` is its distance to the rod.
+    The camera has a field of view of [-1.2, 1.2]^2 m with a rod of length 1 m in it.  A pixel has
+    the value `exp(-d^2 / (2 * 0.3^2))`, where `d` is its distance to the rod.
 
     ## Action Space
 
@@ -76,8 +75,8 @@ class ImageSwingUp(BatchEnvironment):
     ## Observation Space
 
     The observation is a `ndarray` with shape `(800,)` and data type float64.
-    `metadata["observation_groups"]` tells that the pixels of each image belong together, and
-    `metadata["observation_image_shape"]` how they lie.
+    `metadata["observation_groups"]` has the coordinates of each image, and
+    `metadata["observation_image_shape"]` its height and width.
 
     | Num     | Observation                                          | Min | Max |
     |---------|------------------------------------------------------|-----|-----|

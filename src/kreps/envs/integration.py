@@ -1,4 +1,4 @@
-"""One step of control: Runge-Kutta of order four under a held input."""
+"""Integration of the equations of motion over one control period."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ from kreps.kernels.arrays import FloatArray
 def runge_kutta(
     derivative: Callable[[FloatArray], FloatArray], state: FloatArray, time: float, steps: int
 ) -> FloatArray:
-    """``state`` after ``time`` seconds in ``steps`` equal sub-steps; any shape."""
+    """The state after ``time`` seconds, by the Runge-Kutta method of order four.
+
+    Args:
+        derivative: time derivative of a state, with the input held constant.
+        state: at the beginning; of any shape.
+        time: in seconds.
+        steps: number of equal steps.
+    """
     h = time / steps
     for _ in range(steps):
         k1 = derivative(state)

@@ -1,4 +1,4 @@
-"""Reaching with a two-link planar arm (Sec. 4.3): dynamics, batch form, environment."""
+"""Reaching with a planar arm of two links (Sec. 4.3): dynamics, batch model, environment."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SHOULDER = MASS * LINK**2 / 3.0 + MASS * LINK**2  # both links about the should
 
 
 def accelerations(state: FloatArray, torques: FloatArray) -> FloatArray:
-    """Joint accelerations (m, 2) in rad s^-2 of states (m, 4) under torques (m, 2): no gravity."""
+    """Joint accelerations (m, 2) in rad s^-2 of states (m, 4) under torques (m, 2), no gravity."""
     elbow, shoulder_rate, elbow_rate = state[:, 1], state[:, 2], state[:, 3]
     cosine, sine = np.cos(elbow), np.sin(elbow)
     m11 = _SHOULDER + _ELBOW + 2.0 * _COUPLING * cosine
@@ -55,13 +55,13 @@ def reward(state: FloatArray, torques: FloatArray) -> FloatArray:
 
 
 def wrap_angles(states: FloatArray) -> FloatArray:
-    """The states (m, 4), in place, with both angles in [-pi, pi)."""
+    """Wrap both angles of states (m, 4) to [-pi, pi), in place, and return the states."""
     states[:, :2] = (states[:, :2] + np.pi) % (2.0 * np.pi) - np.pi
     return states
 
 
 class ReachingBatch:
-    """The reaching task for m roll-outs at once; see `kreps.envs.batch.BatchModel`."""
+    """The reaching task for m rollouts at once; see `kreps.envs.batch.BatchModel`."""
 
     def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
         return np.tile(START, (len(rngs), 1))
@@ -88,9 +88,9 @@ class Reaching(BatchEnvironment):
     """
     ## Description
 
-    A planar arm of two links, driven at shoulder and elbow, is to move its tip to a target and
-    keep it there with little effort.  There is neither gravity nor friction nor noise: the task is
-    deterministic.
+    A planar arm of two links, actuated at shoulder and elbow, is to move its tip to a target and
+    keep it there with small torques.  There is neither gravity nor friction nor noise, so the task
+    is deterministic.
 
     Both links are uniform rods of 0.5 m and 1 kg.  The arm is controlled at 20 Hz; each period
     is integrated by 10 Runge-Kutta steps of order four under the held torques.
@@ -107,7 +107,7 @@ class Reaching(BatchEnvironment):
     ## Observation Space
 
     The observation is a `ndarray` with shape `(4,)` and data type float64.
-    `metadata["periodic_coordinates"]` tells which coordinates are angles.
+    `metadata["periodic_coordinates"]` lists the coordinates that are angles.
 
     | Num | Observation                              | Min  | Max | Unit  |
     |-----|------------------------------------------|------|-----|-------|

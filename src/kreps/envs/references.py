@@ -1,4 +1,4 @@
-"""Reference values of the tasks: average reward per step of the restarting chain (p = 0.02)."""
+"""Reference rewards of the tasks: average per step of the process with restarts (p = 0.02)."""
 
 from __future__ import annotations
 
@@ -16,8 +16,9 @@ REFERENCE_REWARDS: dict[str, dict[str, float]] = {
         "random torques (0.5 N m)": -0.8,
     },
 }
-"""From best to worst, at least two.  Many learners stop in the constant-torque local optimum: the
-full torque held to one side.  Tests measure all but the best, which `benchmarks/` computes."""
+"""From best to worst, at least two per task.  The constant-torque local optimum is full torque to
+one side at all times, with which many learners end.  Tests measure all but the first of each task,
+which `benchmarks/` computes."""
 
 REFERENCE_REWARDS["kreps/ImageSwingUp-v0"] = REFERENCE_REWARDS["kreps/SwingUp-v0"]
-"""The same process observed by a camera: the optimum with full state information is a bound."""
+"""The same process observed as images, so that the optimum from states is an upper bound."""

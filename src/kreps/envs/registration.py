@@ -1,4 +1,4 @@
-"""Registers the tasks with Gymnasium, so that ``gymnasium.make("kreps/SwingUp-v0")`` finds them."""
+"""Registration of the tasks with Gymnasium, for ``gymnasium.make("kreps/SwingUp-v0")``."""
 
 from __future__ import annotations
 

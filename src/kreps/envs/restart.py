@@ -1,4 +1,4 @@
-"""Restarts at random: what turns a task without end into the process that the paper learns on."""
+"""Random restarts, which make the ergodic process of the paper (Sec. 4.1) of any environment."""
 
 from __future__ import annotations
 
@@ -10,38 +10,45 @@ import numpy as np
 from kreps.errors import ConfigurationError
 from kreps.seeding import Purpose, generator
 
-LONGEST = 2.0**62
-"""Steps that fit into an integer: a restart may be as unlikely as one likes."""
+MAX_LENGTH = 2.0**62
+"""Longest rollout: its number of steps must fit into an integer, however small p is."""
 
 
 def restart_length(rng: np.random.Generator, probability: float) -> int:
-    """Steps until a restart: at least one, ``(1 - p) / p`` on expectation (Sec. 4.1: 49)."""
+    """Number of steps until a restart: at least one, ``(1 - p) / p`` in expectation.
+
+    At p = 0.02 these are 49 (Sec. 4.1).
+    """
     return max(1, int(rng.geometric(probability)) - 1)
 
 
 def stratified_lengths(rng: np.random.Generator, probability: float, count: int) -> list[int]:
-    """So many lengths (count,), each as likely as `restart_length`'s are, but not independent.
+    """Lengths (count,) with the distribution of `restart_length` each, by stratified sampling.
 
     One is drawn from each of ``count`` equally likely ranges of lengths, in random order, so that
-    their sum is nearly what is expected.  At p = 0.02 thirty have 1,470 steps give or take 50, and
-    270 if they are independent; ten have 490, give or take 50 too: it is of the last range.
+    their sum varies little.  At p = 0.02, 30 lengths have 1,470 steps in all with a standard
+    deviation of 50, in place of 270 if they were independent.  Nearly all of it is due to the last
+    range, so that of 10 lengths, with 490 steps, is also 50.
     """
-    # scipy.stats.qmc.LatinHypercube draws alike, but its import takes longer than that of kreps
+    # scipy.stats.qmc.LatinHypercube does the same, but importing it takes longer than kreps does
     survivals = (count - rng.permutation(count) - rng.random(count)) / count
     until_restart = np.ceil(np.log(survivals) / np.log1p(-probability))
-    return np.clip(until_restart - 1.0, 1.0, LONGEST).astype(np.int64).tolist()
+    return np.clip(until_restart - 1.0, 1.0, MAX_LENGTH).astype(np.int64).tolist()
 
 
 class RandomRestart(gym.Wrapper[Any, Any, Any, Any]):
-    """Truncates each episode after a random number of steps, whatever the environment.
+    """Truncates each episode after a random number of steps.
 
-    A restart belongs to the process that is learnt on, but the successor it interrupts is real:
-    so it comes as ``truncated``, with the true successor as the last observation and
-    ``info["restart"] = True``.  The learner is told p and handles restarts analytically.
+    The last observation is the successor of the last step, before the restart.  The step returns
+    ``truncated = True`` and ``info["restart"] = True``.  Learners take p from the wrapper and
+    include restarts in their equations.
 
     Args:
         env: any Gymnasium environment.
-        probability: p, in (0, 1).
+        probability: p, in (0, 1), of a restart at each step.
+
+    Raises:
+        ConfigurationError: a probability outside (0, 1).
     """
 
     def __init__(self, env: gym.Env[Any, Any], probability: float = 0.02) -> None:
@@ -60,7 +67,7 @@ class RandomRestart(gym.Wrapper[Any, Any, Any, Any]):
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._rng = generator(seed, Purpose.RESTART)
-        elif self._rng is None:  # never seeded: as random as the environment itself
+        elif self._rng is None:  # never seeded, so from fresh entropy as Gymnasium does
             self._rng, _ = gym.utils.seeding.np_random()
         self._left = restart_length(self._rng, self.restart_probability)
         return observation, info

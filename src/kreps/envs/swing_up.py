@@ -1,4 +1,4 @@
-"""The underpowered swing-up with control noise (Sec. 4.4): dynamics, batch form, environment."""
+"""The underpowered swing-up with torque noise (Sec. 4.4): dynamics, batch model, environment."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NOISE = TIME_STEP**-0.5  # N m, standard deviation
 
 
 def wrap_angle(theta: FloatArray) -> FloatArray:
-    """``theta`` in [-pi/2, 3 pi/2): upright is 0, hanging is pi, the cut lies at a quarter turn."""
+    """``theta`` wrapped to [-pi/2, 3 pi/2): 0 is upright, pi is hanging."""
     return (theta + 0.5 * np.pi) % (2.0 * np.pi) - 0.5 * np.pi
 
 
@@ -54,7 +54,7 @@ def reward(theta: FloatArray, velocity: FloatArray, torque: FloatArray) -> Float
 
 
 class SwingUpBatch:
-    """The swing-up for m roll-outs at once; see `kreps.envs.batch.BatchModel`."""
+    """The swing-up for m rollouts at once; see `kreps.envs.batch.BatchModel`."""
 
     def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
         return np.tile([np.pi, 0.0], (len(rngs), 1))
@@ -81,10 +81,10 @@ class SwingUp(BatchEnvironment):
     """
     ## Description
 
-    A pendulum hangs from a driven joint and is to be swung up and held upright.  The motor is
-    too weak to lift it directly, so it must be swung back and forth to gain energy.  The torque
-    that acts is the commanded one, limited to what the motor gives, plus noise.  It is the
-    low-dimensional swing-up on which REPS with RKHS embeddings was introduced.
+    A pendulum hangs from an actuated joint and is to be swung up and held upright.  The largest
+    torque cannot lift it directly, so it must be swung back and forth to gain energy.  The torque
+    at the joint is the commanded one, clipped to its limits, plus noise.  It is the
+    low-dimensional swing-up for which REPS with RKHS embeddings was introduced.
 
     The pendulum follows `I theta'' = G sin(theta) + u - k theta'` with inertia
     `I = m l^2 / 3` and weight `G = m g l`, for `m = 10 kg`, `l = 0.5 m`, `g = 9.81 m s^-2` and
@@ -103,7 +103,7 @@ class SwingUp(BatchEnvironment):
     ## Observation Space
 
     The observation is a `ndarray` with shape `(2,)` and data type float64.  The angle is given
-    as it is, not as cosine and sine: `metadata["periodic_coordinates"]` tells that it is one.
+    as one number, not as cosine and sine; `metadata["periodic_coordinates"]` marks it as an angle.
 
     | Num | Observation                 | Min   | Max    | Unit  |
     |-----|-----------------------------|-------|--------|-------|

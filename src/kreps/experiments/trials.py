@@ -15,7 +15,8 @@ from kreps.errors import StorageError
 from kreps.experiments.specs import METHODS, TASKS
 from kreps.kernels.threads import blas_threads
 from kreps.learning.evaluate import evaluate, stochastic_and_greedy
-from kreps.learning.learner import LEARNERS, IterationReport, Learner
+from kreps.learning.learner import IterationReport, Learner
+from kreps.learning.methods import LEARNERS
 from kreps.learning.progress import seconds_by_stage
 from kreps.learning.storage import write_atomically
 from kreps.settings import OnPolicySettings

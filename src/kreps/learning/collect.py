@@ -1,7 +1,7 @@
-"""Collects roll-outs: in batches where the task offers them, step by step from any environment.
+"""Collection of rollouts: in batches if the environment has a batch model, otherwise step by step.
 
-Both ways address their randomness by roll-out, and lengths that are drawn together by batch, so
-they give the same data from the same seed.
+Random numbers of a rollout are addressed by its number and those of stratified lengths by the
+iteration, so that both ways give the same data from the same seed.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ import gymnasium as gym
 import numpy as np
 
 from kreps.data.rollouts import Rollout, Rollouts
-from kreps.data.task import LARGEST, TaskSpec, is_sane
+from kreps.data.task import MAX_MAGNITUDE, TaskSpec, is_sane
 from kreps.envs.batch import BatchModel, SettableModel
 from kreps.envs.restart import restart_length, stratified_lengths
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure
 from kreps.kernels.arrays import FloatArray, grid_points
 from kreps.learning.environment import (
     Environment,
-    _limits,
     batch_model_of,
+    observation_limits,
     time_limit,
 )
 from kreps.policies.base import StochasticPolicy
@@ -42,24 +42,31 @@ def collect(
     exponent: float = WHITE,
     on_rollout: Callable[[int], None] | None = None,
 ) -> Rollouts:
-    """``count`` roll-outs of random length.
+    """Rollouts of a policy, of random length.
 
     Args:
-        stratified: whether their lengths are drawn together (`stratified_lengths`), so that they
-            depend on how many there are; else each is that of `RandomRestart` with its seed.
-        exponent: of the spectrum of the policy's noise (`kreps.exploration.coloured_noise`).
-        on_rollout: called with the number of roll-outs that are complete.
+        env: without `RandomRestart`: lengths are drawn here.
+        task: of the environment.
+        policy: with its exploration noise.
+        count: number of rollouts.
+        seed: of the learner.
+        iteration: number of updates so far; with the seed it addresses all random numbers.
+        restart_probability: p, which determines the distribution of lengths.
+        stratified: whether lengths are stratified (`stratified_lengths`), so that each depends on
+            ``count``.  If not, each is that of `RandomRestart` with the rollout's seed.
+        exponent: of the spectrum of the policy's noise (`coloured_noise`).
+        on_rollout: called with the number of rollouts that are complete.
 
     Raises:
-        EnvironmentFailure: the environment raised.
+        EnvironmentFailure: the environment raised an exception.
         DataError: it returned NaN, infinities or observations of another size.
     """
     seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
     rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
     limit = time_limit(env)
     if stratified:
-        together = generator(seed, Purpose.RESTART, iteration)
-        drawn = stratified_lengths(together, restart_probability, count)
+        rng = generator(seed, Purpose.RESTART, iteration)
+        drawn = stratified_lengths(rng, restart_probability, count)
     else:
         drawn = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
     lengths = [min(length, limit) for length in drawn]
@@ -77,41 +84,48 @@ def collect_grid(
     grid_states: int,
     grid_actions: int,
     *,
-    most: int,
+    max_points: int,
     seed: int,
     iteration: int,
 ) -> Rollouts:
-    """One step from every point of a grid over states and actions: roll-outs of one step.
+    """One step from every point of a grid of states and actions, as rollouts of one step each.
 
     Args:
-        env: its batch model is a `kreps.envs.batch.SettableModel`.
-        ranges: least and largest value of each coordinate; None asks the observation space.
+        env: its batch model must be a `kreps.envs.batch.SettableModel`.
+        task: of the environment.
+        ranges: smallest and largest value of each observation coordinate; None takes those of the
+            observation space.
         grid_states, grid_actions: points per coordinate.  Angles are spaced over a whole turn.
-        most: grid points that may be asked for.
+        max_points: largest number of grid points.
+        seed, iteration: address the random numbers of the steps.
 
     Raises:
         ConfigurationError: the environment cannot be set to a state, or there are too many points.
-        SpaceError: a coordinate has no limits.
+        SpaceError: an observation coordinate has no finite limits.
+        EnvironmentFailure: the environment raised an exception.
+        DataError: it returned NaN, infinities or observations of another size.
     """
     model = batch_model_of(env)
     if model is None or not hasattr(model, "states_at"):
         raise ConfigurationError(
-            f"{env} cannot be set to any state, which a grid of states needs: its batch_model "
-            "would have states_at(observations); use kreps.ValueIteration, which explores by itself"
+            f"{env} cannot be set to a given state, as a grid of states needs: it has no "
+            "batch_model with states_at(observations); use kreps.ValueIteration, which collects "
+            "rollouts from start states"
         )
     count = grid_states**task.observation_size * grid_actions**task.action_size
-    if count > most:
+    if count > max_points:
         raise ConfigurationError(
             f"a grid of {grid_states} points in each of {task.observation_size} state and "
             f"{grid_actions} in each of {task.action_size} action coordinates has "
-            f"{count if count < 10**9 else 'more than 10^9'} points, the limit is {most} (the "
-            "window, and what an exact update can take); lower grid_states or grid_actions"
+            f"{count if count < 10**9 else 'more than 10^9'} points, but at most {max_points} are "
+            "allowed (by the window and the cost of an exact update); lower grid_states or "
+            "grid_actions"
         )
     axes = [
         np.arange(grid_states) * 2.0 * np.pi / grid_states
         if i in task.periodic
         else np.linspace(*limits, grid_states)
-        for i, limits in enumerate(_limits(env, task, ranges))
+        for i, limits in enumerate(observation_limits(env, task, ranges))
     ]
     axes += [
         np.linspace(low, high, grid_actions)
@@ -127,7 +141,7 @@ def collect_grid(
     except DataError:
         raise
     except Exception as error:
-        raise _failure(error, "a grid of states", 0) from error
+        raise _failure(error, "a step from a grid of states", 0) from error
     points = np.stack([observations, successors], axis=1).reshape(2 * count, -1)
     return Rollouts.from_arrays(points, actions, rewards, np.ones(count), ended)
 
@@ -140,7 +154,20 @@ def simulate(
     noises: Sequence[FloatArray],
     on_rollout: Callable[[int], None] | None = None,
 ) -> Rollouts:
-    """One roll-out per seed, with the policy's noise as given, (length, da) each, and as long."""
+    """One rollout per seed, as long as its noise unless the task ends before.
+
+    Args:
+        env: without random restarts.
+        task: of the environment.
+        policy: that acts.
+        seeds: (R,) of the environment.
+        noises: R arrays (length, da) of standard normal numbers for the policy.
+        on_rollout: called with the number of rollouts that are complete.
+
+    Raises:
+        EnvironmentFailure: the environment raised an exception.
+        DataError: it returned NaN, infinities or observations of another size.
+    """
     model = batch_model_of(env)
     if model is not None:
         rollouts = _simulate_batch(model, task, policy, seeds, noises)
@@ -163,7 +190,7 @@ def _simulate_batch(
     noises: Sequence[FloatArray],
 ) -> Rollouts:
     rngs = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
-    ends = np.array([len(noise) for noise in noises])  # shortened where a roll-out really ends
+    ends = np.array([len(noise) for noise in noises])  # lowered where the task ends before
     terminated = np.zeros(len(ends), dtype=bool)
     longest = int(ends.max())
     observations = np.empty((longest + 1, len(ends), task.observation_size))
@@ -188,7 +215,8 @@ def _simulate_batch(
     except DataError:
         raise
     except Exception as error:
-        raise _failure(error, "its batch of roll-outs", t) from error
+        raise _failure(error, "a batch of rollouts", t) from error
+    # steps that were not taken are left out of the padded arrays, one rollout after the other
     numbers = np.arange(longest + 1)
     taken, observed = numbers[:-1] < ends[:, None], numbers <= ends[:, None]
     return Rollouts.from_arrays(
@@ -225,24 +253,25 @@ def _simulate_one(
             actions.append(action)
             rewards.append(float(reward))
     except DataError as error:
-        where = f"roll-out {number} of the environment, after {len(actions)} steps"
+        where = f"rollout {number} of the environment, after {len(actions)} steps"
         raise DataError(f"{where}: {error}") from error
     except Exception as error:
-        raise _failure(error, f"roll-out {number}", len(rewards)) from error
+        raise _failure(error, f"rollout {number}", len(rewards)) from error
     try:
         return Rollout(np.stack(observations), np.stack(actions), np.array(rewards), terminated)
     except DataError as error:
-        raise DataError(f"roll-out {number} of the environment: {error}") from error
+        raise DataError(f"rollout {number} of the environment: {error}") from error
 
 
 def _failure(error: Exception, where: str, steps: int) -> EnvironmentFailure:
     return EnvironmentFailure(
         f"the environment raised {type(error).__name__} in {where}, after {steps} steps: {error}; "
-        "what was learnt before is kept, so mend the environment and call learn() again"
+        "the learner is as after the last update, so repair the environment and call learn() again"
     )
 
 
 def _checked(observations: FloatArray, count: int, task: TaskSpec) -> FloatArray:
+    """The observations, if they are of shape (count, ds)."""
     if np.shape(observations) != (count, task.observation_size):
         raise DataError(
             f"the batch model returned observations of shape {np.shape(observations)}, but "
@@ -252,13 +281,15 @@ def _checked(observations: FloatArray, count: int, task: TaskSpec) -> FloatArray
 
 
 def _state(observation: Any, task: TaskSpec) -> FloatArray:
-    """An observation as a vector the policy can be asked about."""
+    """An observation as a vector (ds,) of finite numbers."""
     state = np.array(observation, dtype=np.float64).ravel()
     if len(state) != task.observation_size:
         raise DataError(
-            f"an observation has {len(state)} coordinates, but the space promises "
+            f"an observation has {len(state)} coordinates, but the observation space has "
             f"{task.observation_size}"
         )
     if not is_sane(state).all():
-        raise DataError(f"an observation holds NaN, an infinity or a number beyond {LARGEST:g}")
+        raise DataError(
+            f"an observation holds NaN, an infinity or a number beyond {MAX_MAGNITUDE:g}"
+        )
     return state

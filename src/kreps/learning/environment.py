@@ -1,8 +1,4 @@
-"""Collects roll-outs: in batches where the task offers them, step by step from any environment.
-
-Both ways address their randomness by roll-out, and lengths that are drawn together by batch, so
-they give the same data from the same seed.
-"""
+"""What is read from a Gymnasium environment: its task, limits, batch model and restarts."""
 
 from __future__ import annotations
 
@@ -22,15 +18,16 @@ Environment = gym.Env[Any, Any]
 
 
 def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec:
-    """What the learner must know of an environment.
+    """The specification of an environment's task.
 
     Args:
         env: any Gymnasium environment with Box observations and bounded Box actions.
         periodic: coordinates of the (flattened) observation that are angles in rad; None takes
-            ``env.metadata["periodic_coordinates"]`` if it is there.
+            ``env.metadata["periodic_coordinates"]`` if it exists.
 
     Raises:
-        SpaceError: a space that cannot be served, with what to do about it.
+        ConfigurationError: not an environment.
+        SpaceError: a space that is not supported.
     """
     if not isinstance(env, gym.Env):
         raise ConfigurationError(
@@ -40,19 +37,19 @@ def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec
     observations, actions = env.observation_space, env.action_space
     if not isinstance(observations, gym.spaces.Box):
         raise SpaceError(
-            f"the observation space is {observations}, but a Box is needed: states are compared "
-            "by distances; wrap the environment in gymnasium.wrappers.FlattenObservation"
+            f"the observation space is {observations}, but a Box is needed, as kernels compare "
+            "states by distances; wrap the environment in gymnasium.wrappers.FlattenObservation"
         )
     if not isinstance(actions, gym.spaces.Box):
         raise SpaceError(
-            f"the action space is {actions}, but a Box is needed: policies choose "
-            "among continuous actions; choose a continuous form of the task, or map a "
-            "Box to these actions with gymnasium.wrappers.TransformAction"
+            f"the action space is {actions}, but a Box is needed, as policies are over continuous "
+            "actions; use a continuous form of the task, or map a Box to these actions with "
+            "gymnasium.wrappers.TransformAction"
         )
     if not actions.is_bounded():
         raise SpaceError(
-            f"the action space {actions} is unbounded, but the first policy needs limits to "
-            "explore within; set them with gymnasium.wrappers.TransformAction and a bounded Box"
+            f"the action space {actions} is unbounded, but the first policy explores within finite "
+            "limits; set them with gymnasium.wrappers.TransformAction and a bounded Box"
         )
     if periodic is None:
         periodic = (env.metadata or {}).get("periodic_coordinates", ())
@@ -66,33 +63,64 @@ def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec
     )
 
 
+def require_same_shape(found: TaskSpec, task: TaskSpec) -> None:
+    """Raise `ConfigurationError` unless an environment's task has the sizes and limits of ``task``.
+
+    Args:
+        found: of the environment.
+        task: of a checkpoint.
+    """
+    same = found.observation_size == task.observation_size and (
+        np.array_equal(found.action_low, task.action_low)
+        and np.array_equal(found.action_high, task.action_high)
+    )
+    if not same:
+        raise ConfigurationError(
+            f"the environment has {found.observation_size} observation coordinates and actions in "
+            f"{found.action_low} to {found.action_high}, the checkpoint {task.observation_size} "
+            f"and {task.action_low} to {task.action_high}; resume in the environment of the "
+            "checkpoint"
+        )
+
+
 def without_restarts(env: Environment) -> tuple[Environment, float | None]:
-    """The environment inside an outermost `RandomRestart`, and its probability."""
+    """The environment inside an outermost `RandomRestart`, and the restart probability.
+
+    The probability is None, and the environment itself is returned, if it has no such wrapper.
+
+    Raises:
+        ConfigurationError: a `RandomRestart` below other wrappers.
+    """
     if isinstance(env, RandomRestart):
         return env.env, env.restart_probability
     if env.has_wrapper_attr("restart_probability"):
         raise ConfigurationError(
-            "the environment has a RandomRestart below other wrappers; make it the outermost one"
+            "the environment has a RandomRestart below other wrappers; make it the outermost "
+            "wrapper"
         )
     return env, None
 
 
 def batch_model_of(env: Environment) -> BatchModel | None:
-    """The task's vectorised form, unless a wrapper that it knows nothing of stands between."""
+    """The vectorised form of an environment; None if it has none that computes the same.
+
+    A wrapper may change what a step does, so only wrappers that are known not to are looked
+    through.
+    """
     transparent = (gym.wrappers.PassiveEnvChecker, gym.wrappers.OrderEnforcing)
     while isinstance(env, transparent):
         env = env.env
     if "batch_model" in vars(env):
         return cast(BatchModel, vars(env)["batch_model"])
     for owner in type(env).__mro__:
-        if "batch_model" in vars(owner):  # a subclass that steps in its own way is not served by it
+        if "batch_model" in vars(owner):  # a subclass with its own step or reset differs from it
             same = all(getattr(type(env), n) is getattr(owner, n) for n in ("step", "reset"))
             return cast(BatchModel, vars(owner)["batch_model"]) if same else None
     return None
 
 
 def time_limit(env: Environment) -> int:
-    """Steps after which a wrapper cuts the environment off, so far as its spec tells."""
+    """Steps after which a `TimeLimit` wrapper truncates; ``sys.maxsize`` without one."""
     while isinstance(env, gym.Wrapper):
         limit = env.spec.max_episode_steps if env.spec is not None else None
         if isinstance(env, gym.wrappers.TimeLimit) and limit is not None:
@@ -101,22 +129,31 @@ def time_limit(env: Environment) -> int:
     return sys.maxsize
 
 
-def _limits(
+def observation_limits(
     env: Environment, task: TaskSpec, ranges: Sequence[tuple[float, float]] | None
 ) -> list[tuple[float, float]]:
-    """Finite limits of each observation coordinate that is no angle."""
+    """Smallest and largest value of each observation coordinate, finite unless it is an angle.
+
+    Args:
+        env: its observation space is used if ``ranges`` is None.
+        task: of the environment.
+        ranges: a pair for each coordinate.
+
+    Raises:
+        SpaceError: a coordinate without finite limits, or a wrong number of ranges.
+    """
     if ranges is None:
         space = cast(gym.spaces.Box, env.observation_space)
         ranges = list(zip(space.low.ravel().tolist(), space.high.ravel().tolist(), strict=True))
-    endless = [
+    unbounded = [
         i
         for i, limits in enumerate(ranges)
         if i not in task.periodic and not np.isfinite(limits).all()
     ]
-    if len(ranges) != task.observation_size or endless:
+    if len(ranges) != task.observation_size or unbounded:
         raise SpaceError(
             f"a grid needs a finite range of each of the {task.observation_size} observation "
-            f"coordinates; {len(ranges)} ranges are given, coordinates {endless} have no limits: "
-            "set ranges, such as ranges=((-3.0, 3.0), (-8.0, 8.0))"
+            f"coordinates; {len(ranges)} ranges are given and coordinates {unbounded} are "
+            "unbounded: set ranges, such as ranges=((-3.0, 3.0), (-8.0, 8.0))"
         )
     return list(ranges)

@@ -1,7 +1,8 @@
-"""How good a policy is: the average reward per step of the restarting chain, with little variance.
+"""Evaluation of a policy: its average reward per step of the process with random restarts.
 
-Roll-outs without restarts are weighted by ``gamma^t``, ``gamma = 1 - p``: a step of the restarting
-chain is step t of its roll-out with that probability.
+Simulated rollouts have no restarts.  Their step t counts with weight ``gamma^t``,
+``gamma = 1 - p``, the probability that there was no restart before it.  That has less variance than
+simulating restarts.
 """
 
 from __future__ import annotations
@@ -20,13 +21,15 @@ from kreps.policies.base import LearntPolicy, StochasticPolicy
 from kreps.seeding import Purpose, generator, integer_seed
 
 EPISODES = 200
+"""Rollouts of a full evaluation."""
+
 STEPS = 400
-"""Of a full evaluation: 400 steps hold all but 3e-4 of the weight at p = 0.02."""
+"""Steps of each rollout in a full evaluation: 400 have all but 3e-4 of the weight at p = 0.02."""
 
 
 @dataclass(frozen=True)
 class Greedy:
-    """A policy without its exploration, as a policy of its own."""
+    """A policy without its exploration noise."""
 
     policy: LearntPolicy
 
@@ -36,7 +39,14 @@ class Greedy:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Average reward per step: mean over ``episodes`` roll-outs and its standard error."""
+    """Average reward per step.
+
+    Attributes:
+        mean: estimated from all rollouts.
+        standard_error: of the mean; 0 if there is only one rollout.
+        episodes: number of rollouts.
+        steps: largest number of steps of a rollout.
+    """
 
     mean: float
     standard_error: float
@@ -53,7 +63,16 @@ def evaluation_rollouts(
     steps: int,
     seed: int,
 ) -> Rollouts:
-    """Roll-outs without restarts; the same seed gives every policy the same random numbers."""
+    """Rollouts without restarts, with the same random numbers for every policy of a seed.
+
+    Args:
+        env: its random restarts, if it has any, are left out.
+        task: of the environment.
+        policy: that acts.
+        episodes: number of rollouts.
+        steps: of each rollout, unless the task ends before.
+        seed: of all random numbers.
+    """
     inside, _ = without_restarts(env)
     return simulate(
         inside,
@@ -68,10 +87,11 @@ def evaluation_rollouts(
 
 
 def discounted_average(rollouts: Sequence[Rollout], restart_probability: float) -> Evaluation:
-    """All rewards weighted by ``gamma^t``, over the sum of all weights.
+    """The sum of all rewards weighted by ``gamma^t``, divided by the sum of all weights.
 
-    A roll-out that really ends is followed by a restart: its weights stop there, so roll-outs count
-    by their weight (renewal reward).  The standard error is that of a ratio (delta method).
+    A rollout whose task ends is followed by a restart and has no further weights, so that short
+    rollouts count less (renewal reward).  The mean is the ratio of two sums over rollouts; its
+    standard error is that of the delta method.
     """
     count = len(rollouts)
     weights = [(1.0 - restart_probability) ** np.arange(len(rollout)) for rollout in rollouts]
@@ -84,7 +104,7 @@ def discounted_average(rollouts: Sequence[Rollout], restart_probability: float) 
 
 
 def stochastic_and_greedy(policy: LearntPolicy) -> dict[str, StochasticPolicy]:
-    """The two ways in which every learnt policy is judged, by name."""
+    """The two policies that are evaluated for every learnt one: with and without exploration."""
     return {"stochastic": policy, "greedy": Greedy(policy)}
 
 
@@ -98,6 +118,16 @@ def evaluate(
     steps: int = STEPS,
     seed: int = 0,
 ) -> Evaluation:
-    """Evaluate a policy by ``episodes`` roll-outs of ``steps`` steps each."""
+    """Average reward per step of a policy, from rollouts without restarts.
+
+    Args:
+        env: its random restarts, if it has any, are left out.
+        task: of the environment.
+        policy: that acts.
+        restart_probability: p of the process.
+        episodes: number of rollouts.
+        steps: of each rollout, unless the task ends before.
+        seed: of all random numbers.
+    """
     rollouts = evaluation_rollouts(env, task, policy, episodes=episodes, steps=steps, seed=seed)
     return discounted_average(rollouts, restart_probability)

@@ -1,6 +1,6 @@
-"""The facade: collect roll-outs, update, report, and do it again.
+"""The learning loop: collect rollouts, update, report.
 
-`Learner` is the surface; `KREPS` and the comparative methods of Sec. 4.2 say how they update.
+`Learner` is the interface that all methods share; `kreps.learning.methods` has the methods.
 """
 
 from __future__ import annotations
@@ -14,38 +14,31 @@ from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
 
-from kreps.algorithms import npalp, value_iteration
 from kreps.algorithms.state import LearnerState, UpdateReport
-from kreps.algorithms.update import update as reps_update
-from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.basis import LinearFunction
 from kreps.kernels.threads import blas_threads
 from kreps.learning import storage
-from kreps.learning.collect import collect, collect_grid
-from kreps.learning.environment import Environment, task_of, without_restarts
+from kreps.learning.collect import collect
+from kreps.learning.environment import (
+    Environment,
+    require_same_shape,
+    task_of,
+    without_restarts,
+)
 from kreps.learning.policy import Policy
 from kreps.policies.base import StochasticPolicy
-from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 from kreps.policies.exploration import PINK, RED, WHITE, BangBang, Gaussian
-from kreps.presets import changed, flat, settings_of
+from kreps.presets import changed, flat
 from kreps.seeding import Purpose, generator
-from kreps.settings import (
-    GridValueIterationSettings,
-    LearnerSettings,
-    NPALPSettings,
-    OnPolicySettings,
-    Settings,
-    ValueIterationSettings,
-)
+from kreps.settings import LearnerSettings, OnPolicySettings
 
 
-def _whole(name: str, value: Any) -> int:
+def _whole_number(name: str, value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, Integral) or value < 0:
         raise ConfigurationError(f"{name} = {value!r}, but it must be a whole number >= 0")
     return int(value)
@@ -53,14 +46,14 @@ def _whole(name: str, value: Any) -> int:
 
 @dataclass(frozen=True)
 class IterationReport:
-    """What a callback is told after each iteration.
+    """Results of one iteration, as passed to callbacks.
 
     Attributes:
-        iteration: updates made, this one included.
-        rollouts, steps: roll-outs and environment steps seen so far.
-        average_reward: per step, over the new roll-outs.
-        update: what the method reports of the update, with CPU seconds by stage.
-        rollout_seconds: CPU seconds that the new roll-outs took.
+        iteration: number of updates, this one included.
+        rollouts, steps: number of rollouts and environment steps so far.
+        average_reward: mean reward per step of the new rollouts.
+        update: the method's own report of the update, with CPU seconds by stage.
+        rollout_seconds: CPU seconds that collecting the new rollouts took.
     """
 
     iteration: int
@@ -72,33 +65,33 @@ class IterationReport:
 
 
 Callback = Callable[[Any, IterationReport], bool | None]
-"""Called with learner and report after each iteration; returning False ends the learning early."""
+"""Called with learner and report after each iteration; returning False stops learning early."""
 
 MethodSettings = TypeVar("MethodSettings", bound=LearnerSettings)
 OnPolicy = TypeVar("OnPolicy", bound=OnPolicySettings)
 
 
 class Learner(Generic[MethodSettings]):
-    """What every method offers: `learn`, `update`, `predict`, `save`, `resume`.
+    """The interface of every method: `learn`, `update`, `predict`, `save`, `resume`.
 
     Args:
         env: a Gymnasium environment with Box observations and bounded Box actions, or a
-            `TaskSpec` if all data comes through `update`.  The learner restarts it at random as
-            in the paper (Sec. 4.1), so it need not end by itself.
-        seed: of everything random; the same seed gives the same policy, byte for byte.
-        periodic: coordinates of the observation that are angles in rad; None asks the
-            environment's ``metadata["periodic_coordinates"]``.
-        threads: BLAS threads while learning; None leaves BLAS as it is.  Another number may
+            `TaskSpec` if all data comes through `update`.  The learner restarts the environment at
+            random as in the paper (Sec. 4.1), so its episodes need not end.
+        seed: of all random numbers; the same seed gives the same policy, byte for byte.
+        periodic: coordinates of the observation that are angles in rad; None takes them from
+            ``env.metadata["periodic_coordinates"]``.
+        threads: BLAS threads while learning; None leaves the number unchanged.  Another number may
             change the last bits of a policy.
         **settings: any field of the method's ``settings_type``.
 
     Raises:
-        SpaceError: the environment's spaces cannot be served.
-        ConfigurationError: unknown or impossible settings.
+        SpaceError: the environment's observation or action space is not supported.
+        ConfigurationError: unknown or invalid settings.
     """
 
     method: ClassVar[str]
-    """Its name in files."""
+    """Name of the method in files."""
 
     settings_type: ClassVar[type[Any]]
 
@@ -114,27 +107,27 @@ class Learner(Generic[MethodSettings]):
         threads: int | None = 1,
         **settings: Any,
     ) -> None:
-        self.seed = _whole("seed", seed)
+        self.seed = _whole_number("seed", seed)
         self.env: Environment | None = None
         if isinstance(env, TaskSpec):
             if periodic is not None:
                 raise ConfigurationError(
-                    f"periodic = {periodic!r} beside a TaskSpec, which names them itself; "
-                    "write TaskSpec(..., periodic=...)"
+                    f"periodic = {periodic!r} is given together with a TaskSpec, which has its "
+                    "own; write TaskSpec(..., periodic=...)"
                 )
             self.task = env
         else:
             self.task = task_of(env, periodic)
             self.env, probability = without_restarts(env)
             if probability is not None:
-                asked = settings.setdefault("restart_probability", probability)
-                if asked != probability:
+                given = settings.setdefault("restart_probability", probability)
+                if given != probability:
                     raise ConfigurationError(
-                        f"restart_probability = {asked!r}, but the environment's RandomRestart has "
-                        f"{probability!r}; give one of them"
+                        f"restart_probability = {given!r}, but the environment's RandomRestart has "
+                        f"{probability!r}; give only one of them"
                     )
         self.settings = self._settings(settings)
-        self.threads = None if threads is None else max(1, _whole("threads", threads))
+        self.threads = None if threads is None else max(1, _whole_number("threads", threads))
         self.state = LearnerState(ReplayWindow(self.task, self.settings.window))
         self._policy: Policy | None = None
 
@@ -145,28 +138,29 @@ class Learner(Generic[MethodSettings]):
         state = self.state
         return (
             f"<{type(self).__name__} seed {self.seed}: {state.iteration} updates from "
-            f"{state.rollouts} roll-outs ({state.steps} steps)>"
+            f"{state.rollouts} rollouts ({state.steps} steps)>"
         )
 
     @property
     def exploring(self) -> bool:
-        """Whether the next roll-outs explore, whatever was learnt: no reward tells of the states.
+        """Whether the next rollouts follow an exploration policy instead of the learnt one.
 
-        Only learners that collect by their own policy do so.  Roll-outs of the window are asked,
-        data sets are not.
+        They do while no reward of the newest rollouts in the window depends on the state: then no
+        goal was reached, and what was learnt can only be to save actions.  Data sets are not
+        considered.  Methods that do not collect by their own policy never explore in this way.
         """
         return False
 
     @property
     def policy(self) -> Policy:
-        """The policy that acts now: the one learnt last, if it was not refused.
+        """The acting policy: that of the latest update that was not rejected.
 
         Raises:
-            ConfigurationError: nothing has been learnt yet.
+            ConfigurationError: there was no update yet.
         """
         if self.state.policy is None:
             raise ConfigurationError(
-                "no policy has been learnt yet; call learn() or update() first"
+                "there is no policy before the first update; call learn() or update()"
             )
         if self._policy is None or self._policy.process is not self.state.policy:
             self._policy = Policy(self.state.policy, self.seed)
@@ -179,24 +173,26 @@ class Learner(Generic[MethodSettings]):
         callback: Callback | Sequence[Callback] = (),
         progress: bool = True,
     ) -> Self:
-        """Make ``iterations`` more updates, each from new roll-outs of the current policy.
+        """Collect rollouts of the current policy and update, ``iterations`` times.
 
         Args:
-            iterations: how many.
+            iterations: number of updates.
             callback: one callable or several, called in order after each iteration.
-            progress: show a live table (in a terminal) or a line per iteration.
+            progress: whether to show a live table (in a terminal) or to print a line per iteration.
 
         Raises:
             ConfigurationError: the learner was made without an environment.
-            EnvironmentFailure: the environment raised; the learner is as after the last update.
-            DataError: the environment returned NaN, infinities or wrong shapes; likewise.
+            EnvironmentFailure: the environment raised an exception.  The learner is left as it was
+                after the last update.
+            DataError: the environment returned NaN, infinities or wrong shapes.  The learner is
+                left likewise.
         """
         if self.env is None:
             raise ConfigurationError(
-                "this learner was made from a TaskSpec and has no environment to roll out in; "
-                "give it data by update(rollouts), or make it from an environment"
+                "this learner was made from a TaskSpec and has no environment to collect rollouts "
+                "in; pass rollouts to update(), or make the learner from an environment"
             )
-        iterations = _whole("iterations", iterations)
+        iterations = _whole_number("iterations", iterations)
         callbacks = [callback] if callable(callback) else list(callback)
         if progress:
             from kreps.learning.progress import ProgressTable
@@ -231,18 +227,18 @@ class Learner(Generic[MethodSettings]):
         return self
 
     def update(self, rollouts: Iterable[Rollout]) -> UpdateReport:
-        """One update from roll-outs collected anywhere; those kept from before count too.
+        """One update from new rollouts, collected anywhere, and those that the window has kept.
 
         Args:
             rollouts: at least one; their actions as commanded, before any clipping.
 
         Raises:
-            DataError: not roll-outs, none of them, or of other widths than the task's.
+            DataError: no rollout, something that is no rollout, or widths that are not the task's.
         """
         if isinstance(rollouts, Dataset):
             raise DataError(
-                f"{type(self).__name__} learns from all samples at once and takes a list of "
-                "roll-outs; only KREPS learns from a data set"
+                f"{type(self).__name__} needs all samples in memory and takes a list of rollouts, "
+                "not a data set; use KREPS for data sets"
             )
         new = Rollouts.from_list(rollouts)
         if not new:
@@ -259,7 +255,10 @@ class Learner(Generic[MethodSettings]):
         return type(self).algorithm(self.state, samples, self.task, self.settings, rng)
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
-        """The next iteration's data."""
+        """The rollouts of the next iteration.
+
+        ``on_rollout`` is called with the number of rollouts that are complete.
+        """
         raise NotImplementedError
 
     def predict(
@@ -273,51 +272,43 @@ class Learner(Generic[MethodSettings]):
         return self.policy.predict(observation, state, episode_start, deterministic)
 
     def save(self, path: str | Path) -> None:
-        """Write a checkpoint from which `resume` goes on as if nothing had happened."""
+        """Write a checkpoint, from which `resume` continues with the same bytes."""
         storage.save_checkpoint(path, self.method, self.state, self.task, self.settings, self.seed)
 
     @classmethod
     def resume(cls, path: str | Path, env: Environment | None = None) -> Self:
-        """A learner as it was when it was saved; settings and seed come from the file.
+        """The learner of a checkpoint, with its settings and seed.
 
         Args:
             path: written by `save`.
-            env: the environment it learnt in; None if all data comes through `update`.
+            env: the environment to continue in; None if all data comes through `update`.
 
         Raises:
-            StorageError: the file is missing, damaged or foreign.
-            ConfigurationError: the environment is not of the shape that was learnt in.
+            StorageError: the file is missing, damaged or not a checkpoint of this method.
+            ConfigurationError: the environment has other observation or action sizes or limits.
         """
         state, task, settings, seed = storage.load_checkpoint(path, cls.method, cls.settings_type)
         learner = cls(task, seed=seed, **flat(settings))
         if env is not None:
             learner.env, _ = without_restarts(env)
-            found = task_of(env, task.periodic)
-            same = found.observation_size == task.observation_size and (
-                np.array_equal(found.action_low, task.action_low)
-                and np.array_equal(found.action_high, task.action_high)
-            )
-            if not same:
-                raise ConfigurationError(
-                    f"the environment has {found.observation_size} observation coordinates and "
-                    f"actions in {found.action_low} to {found.action_high}, the checkpoint "
-                    f"{task.observation_size} and {task.action_low} to {task.action_high}; "
-                    "resume in the environment that it was learnt in"
-                )
+            require_same_shape(task_of(env, task.periodic), task)
         learner.state = state
         return learner
 
 
 class OnPolicyLearner(Learner[OnPolicy]):
-    """A learner that explores by its own stochastic policy, from start states only (Sec. 4.1)."""
+    """A learner that collects rollouts by its own stochastic policy, from start states only.
+
+    These are the rollouts of Sec. 4.1.
+    """
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
-        policy, exponent = self._acting()
+        policy, exponent = self._collecting_policy()
         return collect(
             env,
             self.task,
             policy,
-            self._batch(),
+            self._rollout_count(),
             seed=self.seed,
             iteration=self.state.iteration,
             restart_probability=self.settings.restart_probability,
@@ -326,8 +317,8 @@ class OnPolicyLearner(Learner[OnPolicy]):
             on_rollout=on_rollout,
         )
 
-    def _batch(self) -> int:
-        """Roll-outs of the next iteration."""
+    def _rollout_count(self) -> int:
+        """Number of rollouts in the next iteration."""
         first = self.state.iteration == 0
         return self.settings.initial_rollouts if first else self.settings.rollouts_per_iteration
 
@@ -336,8 +327,8 @@ class OnPolicyLearner(Learner[OnPolicy]):
         window = self.state.window
         return len(window.rollouts) > 0 and not window.newest_depend_on_state
 
-    def _acting(self) -> tuple[StochasticPolicy, float]:
-        """The policy of the next roll-outs, and the exponent of its noise's spectrum."""
+    def _collecting_policy(self) -> tuple[StochasticPolicy, float]:
+        """The policy of the next rollouts, and the exponent of its noise's spectrum."""
         if self.exploring:
             return BangBang(self.task), RED
         if self.state.policy is not None:
@@ -346,138 +337,3 @@ class OnPolicyLearner(Learner[OnPolicy]):
             return BangBang(self.task), WHITE
         gaussian = Gaussian(self.task, self.settings.exploration.scale)
         return gaussian, PINK if self.settings.exploration.noise == "pink" else WHITE
-
-
-class KREPS(OnPolicyLearner[Settings]):
-    """Relative entropy policy search with RKHS embeddings.
-
-    Args:
-        env, seed, periodic, threads: as of `Learner`.
-        recipe: ``"default"``, ``"observed"`` (one step on the actions that were taken), ``"paper"``
-            (close to the printed method) or a `kreps.Settings`.
-        compute: who works on the chunks of updates of low rank, and in which arrays; not part of a
-            checkpoint, so set it again after `resume`: ``learner.compute = ...``.
-        **settings: any field of `kreps.Settings`, such as ``kl_bound``.
-
-    Raises:
-        SpaceError: the environment's spaces cannot be served.
-        ConfigurationError: unknown or impossible settings.
-    """
-
-    method = "reps"
-    settings_type = Settings
-
-    def __init__(
-        self,
-        env: Environment | TaskSpec,
-        *,
-        seed: int = 0,
-        preset: str | Settings = "model_based",
-        periodic: Sequence[int] | None = None,
-        threads: int | None = 1,
-        compute: Compute | None = None,
-        **settings: Any,
-    ) -> None:
-        self._preset = preset
-        self.compute = compute or Compute()
-        super().__init__(env, seed=seed, periodic=periodic, threads=threads, **settings)
-
-    def _settings(self, changes: dict[str, Any]) -> Settings:
-        return settings_of(self._preset, **changes)
-
-    def update(self, rollouts: Iterable[Rollout] | Dataset) -> UpdateReport:
-        """One update from roll-outs collected anywhere; those kept from before count too.
-
-        A policy that the model finds worse than the one before is refused, and that one stays; the
-        report says so (``refused``).
-
-        Args:
-            rollouts: at least one; their actions as commanded, before any clipping.  Or a
-                `kreps.Dataset` of any size, which is learnt from alone and not kept: later updates
-                see only the roll-outs that were given as such.
-
-        Raises:
-            DataError: not roll-outs, none of them, or of other widths than the task's.
-            ConfigurationError: a data set with ``approximation="exact"``.
-            StorageError: a data set's file that is damaged, or not as it was when it was opened.
-        """
-        if not isinstance(rollouts, Dataset):
-            return super().update(rollouts)
-        return self._update(rollouts)
-
-    def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:
-        return reps_update(self.state, samples, self.settings, rng, self.compute)
-
-    @property
-    def value_function(self) -> LinearFunction:
-        """V of the last update (Eq. 3), in units of the reward.
-
-        Raises:
-            ConfigurationError: nothing has been learnt yet.
-        """
-        if self.state.value is None:
-            raise ConfigurationError("no V has been learnt yet; call learn() or update() first")
-        return self.state.value
-
-
-class ValueIteration(OnPolicyLearner[ValueIterationSettings]):
-    """Value iteration with RKHS embeddings, exploring by softmax (Gruenewaelder et al. 2012).
-
-    Arguments and errors are those of `Learner`; settings `kreps.settings.ValueIterationSettings`.
-    """
-
-    method = "value-iteration"
-    settings_type = ValueIterationSettings
-    algorithm = staticmethod(value_iteration.update)
-
-
-class GridValueIteration(Learner[GridValueIterationSettings]):
-    """Off-policy value iteration with RKHS embeddings on a grid of states and actions.
-
-    It is given what no robot offers: a simulator that can be set to any state.  Its environment
-    needs a ``batch_model`` with ``states_at`` (see `kreps.envs.batch.SettableModel`), as
-    `kreps/SwingUp-v0` and `kreps/Reaching-v0` have it.  Each iteration tries one step from every
-    grid point; one iteration is enough.
-
-    Arguments and errors are those of `Learner`; settings
-    `kreps.settings.GridValueIterationSettings`.
-    """
-
-    method = "grid-value-iteration"
-    settings_type = GridValueIterationSettings
-    algorithm = staticmethod(value_iteration.update)
-
-    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
-        settings = self.settings
-        rollouts = collect_grid(
-            env,
-            self.task,
-            settings.ranges,
-            settings.grid_states,
-            settings.grid_actions,
-            most=min(settings.window or MAX_SUPPORT, MAX_SUPPORT),
-            seed=self.seed,
-            iteration=self.state.iteration,
-        )
-        if on_rollout is not None:
-            on_rollout(len(rollouts))
-        return rollouts
-
-
-class NPALP(OnPolicyLearner[NPALPSettings]):
-    """Non-parametric approximate linear programming (Pazis and Parr 2011).
-
-    For deterministic tasks only: it takes the best that was seen to happen for what will happen.
-
-    Arguments and errors are those of `Learner`; settings `kreps.settings.NPALPSettings`.
-    """
-
-    method = "npalp"
-    settings_type = NPALPSettings
-    algorithm = staticmethod(npalp.update)
-
-
-LEARNERS: dict[str, type[Learner[Any]]] = {
-    learner.method: learner for learner in (KREPS, ValueIteration, GridValueIteration, NPALP)
-}
-"""By name in files."""

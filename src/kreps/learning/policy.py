@@ -1,4 +1,4 @@
-"""The policy as its user holds it: predict, save, load, compress, export."""
+"""The learnt policy as users have it: predict, save, load, compress, export."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from kreps.data.task import LARGEST, is_sane
+from kreps.data.task import MAX_MAGNITUDE, is_sane
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import FloatArray
 from kreps.learning import storage
@@ -23,7 +23,7 @@ class Policy:
     """A learnt stochastic policy, with Stable-Baselines3's signature of `predict`.
 
     Args:
-        process: what it draws from, for REPS a cost-sensitive Gaussian process.
+        process: the distribution of actions, for KREPS a cost-sensitive Gaussian process.
         seed: of the exploration noise in `predict`.
     """
 
@@ -39,15 +39,17 @@ class Policy:
         episode_start: Any = None,
         deterministic: bool = False,
     ) -> tuple[FloatArray, Any]:
-        """Actions for one observation or a batch of them, clipped to the task's limits.
+        """Actions for one observation or several, clipped to the task's limits.
 
         Args:
             observation: (ds,) or (m, ds).
-            state, episode_start: accepted for compatibility; this policy has no memory.
-            deterministic: the policy without its exploration (the mean of a Gaussian process).
+            state, episode_start: accepted for compatibility and not used, as the policy depends on
+                the observation alone.
+            deterministic: whether to leave out the exploration noise (the mean of a Gaussian
+                process).
 
         Returns:
-            Action (da,) or actions (m, da) in the task's units, and ``state`` as it came.
+            Action (da,) or actions (m, da) in the task's units, and ``state`` unchanged.
 
         Raises:
             DataError: another shape, NaN or infinities.
@@ -64,8 +66,8 @@ class Policy:
             )
         if not is_sane(batch).all():
             raise DataError(
-                f"the observation holds NaN, an infinity or a number beyond {LARGEST:g}: "
-                "no action is safe there"
+                f"the observation holds NaN, an infinity or a number beyond {MAX_MAGNITUDE:g}, for "
+                "which no action is defined; check the sensors"
             )
         states = np.atleast_2d(batch)
         if deterministic:
@@ -77,20 +79,24 @@ class Policy:
         return (actions[0] if batch.ndim == 1 else actions), state
 
     def save(self, path: str | Path) -> None:
-        """Write the policy as arrays and JSON; read it back with `kreps.load_policy`."""
+        """Write the policy to a file; read it with `kreps.load_policy`."""
         storage.save_policy(self.process, path)
 
     def compressed(self, centres: int) -> Policy:
-        """This policy on at most ``centres`` support points: a smaller model, a faster cycle.
+        """A sparse approximation of this policy, which is smaller and predicts faster.
 
-        All samples still count, and far from the centres the exploration is that of the prior.
-        How much performance it costs is worth an evaluation: see ``benchmarks/predict.py``.
+        It is fitted to all samples of this policy.  Far from its centres the exploration noise is
+        that of the prior.  Evaluate it to see what the approximation costs in reward, as
+        ``benchmarks/predict.py`` does.
+
+        Args:
+            centres: largest number of support points.
 
         Returns:
-            A policy with this one's seed, or this policy if it has no more centres.
+            A policy with the same seed, or this policy if it has no more centres.
 
         Raises:
-            ConfigurationError: fewer than one centre, or a policy that has no samples to compress.
+            ConfigurationError: fewer than one centre, or a policy without samples.
         """
         try:
             count = operator.index(centres)
@@ -100,7 +106,7 @@ class Policy:
             ) from error
         if count < 1:
             raise ConfigurationError(
-                f"centres = {count}, but a policy needs at least one; 50 are often enough"
+                f"centres = {count}, but at least one is needed; 50 are often enough"
             )
         process = self.process
         if isinstance(process, CostSensitiveGP):
@@ -109,27 +115,27 @@ class Policy:
             raise ConfigurationError(_no_process(process, "compress"))
         if len(process.states) > count:
             raise ConfigurationError(
-                f"the policy has {len(process.states)} centres and no samples any more, {count} "
-                f"were asked for; compress the exact policy, or learn with rank = {count}"
+                f"the policy has {len(process.states)} centres and does not keep its samples, so "
+                f"it cannot be compressed to {count}; compress the exact policy, or learn with "
+                f"low_rank=kreps.LowRank(rank={count})"
             )
         return self
 
     def export_onnx(self, path: str | Path, dtype: str = "float64") -> str:
-        """Write an ONNX model of the policy, for controllers without Python.
+        """Write an ONNX model of the policy without exploration, for controllers in any language.
 
-        Its input is ``observation`` (batch, ds), its outputs are ``action`` (batch, da), the mean
+        Its input is ``observation`` (batch, ds).  Its outputs are ``action`` (batch, da), the mean
         clipped to the task's limits, and ``standard_deviation`` (batch, da) of the commanded
         action, both in the task's units.
-        A model is for following the policy without its exploration.
 
         Args:
             path: such as ``policy.onnx``; the folder must exist.
-            dtype: "float64" or "float32", of input and outputs.  All arithmetic is of the same
-                type, unless float32 could put the mean off by 1e-4 of the action scale: then it
-                is float64 all the same.  Compressed policies are well within that.
+            dtype: "float64" or "float32", of input and outputs.  The model computes in the same
+                type, unless float32 could change the mean by 1e-4 of the action scale; then it
+                computes in float64.  For compressed policies float32 is accurate enough.
 
         Returns:
-            The type of the arithmetic.
+            The type that the model computes in.
 
         Raises:
             ConfigurationError: ONNX is not installed (``pip install 'kreps[onnx]'``), or the
@@ -146,16 +152,16 @@ class Policy:
 
 def _no_process(process: LearntPolicy, verb: str) -> str:
     return (
-        f"there is no Gaussian process to {verb} in a policy of type {type(process).__name__}; "
-        "learn one with kreps.KREPS, or save this policy as it is"
+        f"cannot {verb} a policy of type {type(process).__name__}, only Gaussian processes; "
+        "learn one with kreps.KREPS, or use Policy.save"
     )
 
 
 def mean_difference(exact: Policy, compressed: Policy) -> float:
-    """Root mean square of what compression does to actions without exploration.
+    """Root mean square difference of the actions of two policies, without exploration.
 
-    At the support points of the exact policy, in units of the action scale, after clipping: small
-    where the policy is as good as before, which `kreps.evaluation` can confirm.
+    It is taken at the support points of the exact policy, after clipping, in units of the action
+    scale.
     """
     process = exact.process
     assert isinstance(process, CostSensitiveGP | SparseGP)
@@ -164,9 +170,13 @@ def mean_difference(exact: Policy, compressed: Policy) -> float:
 
 
 def load_policy(path: str | Path, seed: int = 0) -> Policy:
-    """A policy saved by `Policy.save`; ``seed`` is that of its exploration noise.
+    """A policy saved by `Policy.save`.
+
+    Args:
+        path: of the file.
+        seed: of the exploration noise in `Policy.predict`.
 
     Raises:
-        StorageError: the file is missing, damaged or foreign.
+        StorageError: the file is missing, damaged or not a policy.
     """
     return Policy(storage.load_policy(path), seed)

@@ -1,4 +1,4 @@
-"""The live progress display of `Learner.learn`: a table in a terminal, plain lines elsewhere."""
+"""The progress display of `Learner.learn`: a live table in a terminal, lines of text elsewhere."""
 
 from __future__ import annotations
 
@@ -20,15 +20,20 @@ if TYPE_CHECKING:
     from kreps.learning.learner import IterationReport, Learner
 
 SHOWN_ROWS = 24
+"""Rows of the live table: those of the latest iterations."""
 
 
 def seconds_by_stage(report: IterationReport) -> dict[str, float]:
-    """CPU seconds of one iteration, roll-outs included."""
+    """CPU seconds of each stage of one iteration, collecting rollouts included."""
     return {"rollouts": report.rollout_seconds, **report.update.seconds}
 
 
 class ProgressTable:
-    """A callback that shows each iteration as a row, and the time that is left."""
+    """A callback that shows each iteration as a row, and the remaining time.
+
+    Args:
+        target: number of updates after which learning ends.
+    """
 
     def __init__(self, target: int) -> None:
         self._console = Console()
@@ -64,7 +69,8 @@ class ProgressTable:
             print(self._stage_line(), flush=True)
 
     def rollouts_done(self, count: int) -> None:
-        self._bar.update(self._task, note=f"{count} roll-outs")
+        """Show how many rollouts of the iteration are complete."""
+        self._bar.update(self._task, note=f"{count} rollouts")
 
     def __call__(self, learner: Learner[Any], report: IterationReport) -> None:
         stages = seconds_by_stage(report)
@@ -73,7 +79,7 @@ class ProgressTable:
         shown = report.update.shown()
         note = shown.pop("note", "")
         if learner.exploring:
-            note = f"{note}  no reward tells of the states: exploring".strip()
+            note = f"{note}  no state-dependent reward: exploring".strip()
         row = {
             "iter": f"{report.iteration}",
             "steps": f"{report.steps}",
@@ -87,8 +93,7 @@ class ProgressTable:
             self._bar.update(self._task, completed=report.iteration)
             self._live.update(self._layout())
         else:
-            shown = [f"{name} {value}" for name, value in row.items() if value]
-            print("  ".join(shown), flush=True)
+            print("  ".join(f"{name} {value}" for name, value in row.items() if value), flush=True)
 
     def _layout(self) -> Table:
         table = Table(box=None, pad_edge=False)
