@@ -1,10 +1,10 @@
 # %% [markdown]
 # # One update, step by step
 #
-# A policy is a rule that picks an action in each state, with some randomness. This walk makes
-# **one** update of such a policy by REPS with RKHS embeddings (Algorithm 1 of the paper), on a
-# problem so small that every quantity can be drawn. Each step is a call of the library; only the
-# simulated bead and the true values drawn for comparison are made here.
+# A stochastic policy is a distribution over actions for each state. This page makes **one** update
+# of such a policy by REPS with RKHS embeddings (Algorithm 1 of the paper), on a problem so small
+# that every quantity can be drawn. Each step calls functions of the library. Only the simulation
+# and the true values that are drawn for comparison are written here.
 
 # %%
 from __future__ import annotations
@@ -22,7 +22,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from kreps.algorithms import reps
 from kreps.algorithms.dual import (
     DualProblem,
     bellman_errors,
@@ -34,20 +33,33 @@ from kreps.algorithms.dual import (
     standardise,
 )
 from kreps.algorithms.newton import solve_dual
+from kreps.algorithms.policy_targets import (
+    PolicyTargets,
+    exploration_noise,
+    policy_hyperparameters,
+)
+from kreps.algorithms.reps import stationarity_ridge
 from kreps.algorithms.state import LearnerState
+from kreps.algorithms.update import update
+from kreps.data.compute import Compute
 from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.envs.restart import restart_length
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import KernelExpansion, RKHSBasis
-from kreps.kernels.regression import KernelEmbedding
-from kreps.models.transition import feature_differences, state_kernel, successor_features
+from kreps.models.transition import (
+    feature_differences,
+    fit_embedding,
+    state_kernel,
+    successor_features,
+)
 from kreps.plotting import BLUE, GREY, ORANGE, STYLE
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 from kreps.policies.exploration import Gaussian
-from kreps.settings import settings_of
+from kreps.presets import settings_of
+from kreps.settings import RKHS
 
 NOTEBOOK = "ipykernel" in sys.modules
 parser = argparse.ArgumentParser(
@@ -61,25 +73,26 @@ args = parser.parse_args([] if NOTEBOOK else None)
 # %% [markdown]
 # ## The problem
 #
-# A bead sits on a ring. Its state `s` is its position, an angle in rad from the goal at 0; the
-# action `a` is a commanded velocity in rad/s, applied up to ±2. In each period of 0.3 s the bead
-# moves by 0.3 s times the applied velocity, and by noise of standard deviation 0.25 rad. The
-# reward of a step is `r = cos(s) - 1`: 0 at the goal, -2 opposite to it. It does not depend on the
-# action, so only the *future* can tell a good action from a bad one.
+# A bead moves on a ring. Its state `s` is its position, an angle in rad from the goal at 0. The
+# action `a` is a commanded velocity in rad/s, clipped to ±2 before it is applied. In each period of
+# 0.3 s the bead moves by 0.3 s times the applied velocity, plus noise of standard deviation
+# 0.25 rad. The reward of a step is `r = cos(s) - 1`: 0 at the goal, -2 opposite to it. The reward
+# does not depend on the action, so actions differ only in the rewards of *later* steps.
 #
-# The process restarts with probability `1 - gamma = 1/16` per step: a roll-out ends, and the next
-# one starts at a uniformly random position. What is maximised is the average reward per step.
+# The process restarts with probability `1 - gamma = 1/16` per step. Then the rollout ends, and the
+# next one starts at a uniformly random position. The objective is the average reward per step.
 
 # %%
 PERIOD, NOISE, GAMMA = 0.3, 0.25, 15 / 16
 task = TaskSpec(
     observation_size=1, action_low=np.array([-2.0]), action_high=np.array([2.0]), periodic=(0,)
 )
-settings = settings_of("observed", restart_probability=1.0 - GAMMA)
+settings = settings_of("single_step", restart_probability=1.0 - GAMMA)
+assert isinstance(settings.value, RKHS)
 
 
 def wrap(angle: FloatArray) -> FloatArray:
-    """The same position in [-pi, pi)."""
+    """The same position as an angle in [-pi, pi)."""
     return (angle + np.pi) % (2.0 * np.pi) - np.pi
 
 
@@ -88,7 +101,7 @@ def reward(state: FloatArray) -> FloatArray:
 
 
 def simulate(policy: StochasticPolicy, count: int, rng: np.random.Generator) -> list[Rollout]:
-    """Roll-outs of the bead, each until its first restart."""
+    """Rollouts of the bead, each up to its first restart."""
     rollouts = []
     for _ in range(count):
         states, actions = [rng.uniform(-np.pi, np.pi, size=1)], []
@@ -102,7 +115,7 @@ def simulate(policy: StochasticPolicy, count: int, rng: np.random.Generator) -> 
 
 
 def average_reward(rollouts: list[Rollout]) -> float:
-    """Per step, over all roll-outs."""
+    """Mean over all steps of all rollouts."""
     return float(np.concatenate([r.rewards for r in rollouts]).mean())
 
 
@@ -167,14 +180,15 @@ def show(figure: Figure, name: str) -> None:
 # %% [markdown]
 # ## 1. The data
 #
-# The first policy explores: it commands velocities `a ~ N(0, 1.4^2)` whatever the state
-# ([`Gaussian`](../src/kreps/policies.py)). A few roll-outs give `n` samples
+# The first policy explores: in every state it draws a velocity `a ~ N(0, 1.4^2)`
+# ([`Gaussian`](../src/kreps/policies/exploration.py)). A few rollouts give `n` samples
 # `(s_i, a_i, r_i, s'_i)`, where `s'_i` is the successor of `s_i`
-# ([`Transitions`](../src/kreps/data.py)). The learner sees nothing else: it knows neither the
-# motion nor the reward function, only the restart probability and the limits of the action.
+# ([`Transitions`](../src/kreps/data/rollouts.py)). The samples, the restart probability and the
+# limits of the action are the only input of the learner. The dynamics and the reward function are
+# not.
 #
-# Left: a cross marks where a roll-out ended. Lines break where the bead passes from π to -π.
-# Right: each point is one sample. Its colour changes from left to right but not from bottom to
+# Left: a cross marks the end of a rollout. Lines are interrupted where the bead passes from π to
+# -π. Right: each point is one sample. Its colour changes from left to right but not from bottom to
 # top, as the reward does not depend on the action. Commands beyond the dashed limits are clipped
 # before they are applied.
 
@@ -182,7 +196,7 @@ def show(figure: Figure, name: str) -> None:
 rng = np.random.default_rng(args.seed)
 explorer = Gaussian(task, scale=0.7)  # in units of the largest velocity
 rollouts = simulate(explorer, args.rollouts, rng)
-data = ReplayWindow(args.rollouts).extend(rollouts).transitions
+data = ReplayWindow(task, args.rollouts).append(rollouts).transitions
 n = len(data)
 states, actions = data.states[:, 0], data.actions[:, 0]
 
@@ -191,7 +205,7 @@ with rc_context(STYLE):
     draw_rollouts(left, rollouts)
     left.set_xlim(right=1.12 * left.get_xlim()[1])
     left.annotate("goal", (left.get_xlim()[1], 0.0), ha="right", va="bottom", color=GREY)
-    left.set_title(f"{len(rollouts)} roll-outs of the exploring policy")
+    left.set_title(f"{len(rollouts)} rollouts of the exploring policy")
     dots = right.scatter(states, actions, c=data.rewards, s=16, cmap="viridis", lw=0)
     action_plane(right)
     right.set_title(f"{n} samples")
@@ -201,29 +215,30 @@ show(figure, "1_data")
 # %% [markdown]
 # ## 2. The kernel and a basis
 #
-# A kernel says how alike two states are. On the ring it is periodic,
+# A kernel measures the similarity of two states. On the ring it is periodic,
 #
-# `k(s, t) = exp(-2 sin^2((s - t) / 2) / l^2)` ([`Periodic`](../src/kreps/kernels.py)),
+# `k(s, t) = exp(-2 sin^2((s - t) / 2) / l^2)` ([`Periodic`](../src/kreps/kernels/kernel.py)).
 #
-# with the lengthscale `l` at the median distance of the samples
-# ([`state_kernel`](../src/kreps/algorithms/transition_model.py)). Its values for all pairs of
-# sampled states make the Gram matrix (left). Sorted by position it is bright along the diagonal,
-# and in two corners: there the ring closes.
+# The lengthscale `l` is the median distance of the samples
+# ([`state_kernel`](../src/kreps/models/transition.py)). The kernel values of all pairs of sampled
+# states form the Gram matrix (left). With the states sorted by position, it is large along the
+# diagonal and in two corners, because positions near -π and π are neighbours on the ring.
 #
-# Functions of the state are sums of kernels at the sampled states (Eq. 3 of the paper).
-# Neighbouring kernels are nearly the same function, so few are needed: pivoted Cholesky picks
+# Functions of the state are weighted sums of kernels at the sampled states (Eq. 3 of the paper).
+# Neighbouring kernels are nearly the same function, so few are needed. Pivoted Cholesky selects
 # states, the *pivots*, until no kernel function has more than 1e-6 of its squared norm outside the
-# span of the picked ones (right). That gives orthonormal features `phi_1(s), ..., phi_m(s)`,
-# together the vector `phi(s)` (middle: the first four, each with a dot at its pivot, and grey
-# marks at the other pivots; [`RKHSBasis.fit`](../src/kreps/value.py)). From here on a function of
-# the state is `phi(s)' theta` with a short vector `theta`; a dash after a vector or a matrix
-# transposes it.
+# span of the selected ones (right). This gives orthonormal features `phi_1(s), ..., phi_m(s)`,
+# together the vector `phi(s)` ([`RKHSBasis.fit`](../src/kreps/kernels/basis.py)). Middle: the first
+# four features, each with a dot at its pivot, and grey marks at the other pivots. From here on a
+# function of the state is `phi(s)' theta` with a short vector `theta`. A dash after a vector or a
+# matrix denotes its transpose.
 
 # %%
 update_rng = np.random.default_rng([args.seed, 1])
 kernel = state_kernel(data, task, update_rng)
-basis, features = reps.value_basis(data, kernel, settings)  # a row phi(s) per state, all states
-assert isinstance(basis, RKHSBasis)
+basis, features = RKHSBasis.fit(  # features: a row phi(s) for each state of a rollout
+    kernel, data.points, tolerance=settings.value.tolerance, max_rank=settings.value.max_rank
+)
 
 order = np.sort(data.points, axis=0)
 on_grid = basis.features(GRID[:, None])
@@ -254,45 +269,45 @@ with rc_context(STYLE):
     middle.set_title("Features and pivots")
     count = np.arange(1, features.shape[1] + 1)
     right.semilogy(count, np.maximum(residuals.max(axis=0), 1e-12), "o-", color=BLUE, ms=3)
-    right.axhline(settings.basis_tolerance, color=GREY, lw=0.8, ls="--")
+    right.axhline(settings.value.tolerance, color=GREY, lw=0.8, ls="--")
     right.set_xlabel("number of features")
-    right.set_title("Squared norm left out")
+    right.set_title("Squared norm outside")
 show(figure, "2_kernel")
 
 # %% [markdown]
 # ## 3. The embedding: expected successors
 #
-# One observed successor says little about an action, as its noise is nearly as large as what the
-# action did. So the expectation of a function `f` of the successor is taken over *all* samples, as
-# that of its change (Eq. 4, counted from the state's own value):
+# A single observed successor is a poor estimate of the effect of an action, because the noise is
+# nearly as large as the effect. The expectation of a function `f` of the successor is therefore
+# estimated from *all* samples, through the change of `f` (Eq. 4, applied to the change instead of
+# the value):
 #
 # `E[f(s') | s, a] = f(s) + sum_i beta_i(s, a) (f(s'_i) - f(s_i))` with
 # `beta(s, a) = (K + lambda I)^-1 k(s, a)`.
 #
-# `K` holds the kernel values of all pairs of samples, now over states *and* applied actions;
-# `k(s, a)` those of the samples with the pair asked for; `lambda` is a small number that stands
-# for the noise. The strength `beta_i` says how much sample `i` counts
-# ([`KernelEmbedding.strengths`](../src/kreps/embedding.py)). Far from the data all strengths fade
-# to zero, and the expectation to its origin `f(s)`: that the state stays is a better guess there
-# than that `f` vanishes, as it would without the origin
-# ([`embedding_origin`](../src/kreps/algorithms/reps.py)). The lengthscales and `lambda` are fitted
-# by predicting how the features of each sample change from the other samples
-# ([`fit_embedding`](../src/kreps/algorithms/transition_model.py)).
+# `K` holds the kernel values of all pairs of samples, now over states *and* applied actions. The
+# vector `k(s, a)` holds the kernel values of the samples with the pair `(s, a)`. The regulariser
+# `lambda` accounts for the noise. The strength `beta_i` is the weight of sample `i`
+# ([`KernelEmbedding.strengths`](../src/kreps/kernels/regression.py)). Far from the data all
+# strengths are near zero, and the estimate is `f(s)`: the state does not change. Without the
+# difference, the estimate there would be zero, which is a worse guess. The lengthscales and
+# `lambda` minimise the leave-one-out error of the predicted changes of the features
+# ([`fit_embedding`](../src/kreps/models/transition.py)).
 #
-# Left: the strengths for the pair at the star; samples near it in state and action count. Middle:
-# for the same pair, how near the successor is expected to be to each position `t`, that is
-# `E[k(t, s')]`. The dotted curve is the origin, as if the state stayed; the strengths move it close
-# to the truth, which the learner never sees. Right: the expectations of one function,
-# `f(s') = k(0, s')`, the kernel at the goal, for all samples against the truth. The single observed
-# values scatter widely about the dashed line; the embedding has averaged most of the noise away.
+# Left: the strengths for the pair at the star. Samples close to it in state and action have the
+# largest ones. Middle: for the same pair, the expected kernel value `E[k(t, s')]` of the successor
+# and each position `t`. The dotted curve is the estimate without data, for which the state does
+# not change. The embedding is close to the truth, which is computed from the simulation and is not
+# an input of the learner. Right: the expectations of one function, the kernel at the goal
+# `f(s') = k(0, s')`, for all samples against the truth. The single observed values scatter widely
+# about the dashed line. The embedding averages most of the noise out.
 
 # %%
 successors = successor_features(data, features)  # a row phi(s'_i) per sample
-origin = reps.embedding_origin(data, features, settings)  # a row phi(s_i) per sample
-changes = successors - origin
-model, _ = reps.transition_model(data, changes, kernel, task, settings, None, update_rng)
-assert isinstance(model, KernelEmbedding)
-expected = origin + model.expected_features(changes)  # a row E[phi(s') | s_i, a_i] per sample
+own = features[data.state]  # a row phi(s_i) per sample
+changes = successors - own
+model, _ = fit_embedding(data, changes, kernel, task, None, update_rng)
+expected = own + model.expected_features(changes)  # a row E[phi(s') | s_i, a_i] per sample
 
 pair = np.array([[0.5, -1.0]])  # rad, rad/s
 in_units = np.column_stack([pair[:, :1], task.scaled_applied(pair[:, 1:])])
@@ -312,7 +327,7 @@ nodes, node_weights = np.polynomial.hermite_e.hermegauss(20)  # for expectations
 
 
 def true_expectation(function: KernelExpansion) -> FloatArray:
-    """E[f(s') | s_i, a_i] by the true motion and quadrature: for comparison only."""
+    """E[f(s') | s_i, a_i] by the true dynamics and quadrature, for comparison only."""
     mean = data.states + PERIOD * task.clip(data.actions)
     values = [function(wrap(mean + NOISE * node)) for node in nodes]
     expectation: FloatArray = node_weights @ np.array(values) / node_weights.sum()
@@ -340,16 +355,16 @@ with rc_context(STYLE):
     dots = left.scatter(states[rank], actions[rank], c=beta[rank], s=16, **look)
     left.plot(*pair.T, "*", color="black", ms=9)
     action_plane(left)
-    left.set_title("Strengths β for the star ...")
+    left.set_title("Strengths β for the star")
     figure.colorbar(dots, ax=left, pad=0.02)
-    middle.plot(GRID, at_pair, color=GREY, ls=":", label="if the state stayed")
+    middle.plot(GRID, at_pair, color=GREY, ls=":", label="no change of state")
     middle.plot(GRID, true_at_pair, color=ORANGE, lw=1.6, label="truth")
     middle.plot(GRID, embedded_at_pair, color=BLUE, label="embedding")
     position_axis(middle)
     middle.set_xlabel("position t [rad]")
     middle.set_ylim(top=1.5)
     middle.legend(loc="upper left", handlelength=1.4)
-    middle.set_title("... and the E[k(t, s')]")
+    middle.set_title("E[k(t, s')] for the star")
     right.axline((1.0, 1.0), slope=1.0, color=GREY, lw=0.8, ls="--")
     right.plot(
         true_f, observed_f, "o", color=ORANGE, ms=3, alpha=0.6, mew=0, label="observed f(s')"
@@ -361,52 +376,52 @@ with rc_context(STYLE):
 show(figure, "3_embedding")
 
 # %% [markdown]
-# ## 4. The dual: how far to go
+# ## 4. The dual: sample weights within a KL bound
 #
-# Each sample gets a weight `p_i >= 0`, all adding up to one. They are to maximise the weighted
-# reward `sum_i p_i r_i` under two constraints.
+# Each sample gets a weight `p_i >= 0`; the weights sum to one. They maximise the weighted reward
+# `sum_i p_i r_i` under two constraints.
 #
-# *A bounded step*: `KL(p || uniform) = sum_i p_i log(n p_i)`, the distance of the weights from the
-# data, is at most `epsilon` (here 1 nat).
+# *KL bound*: `KL(p || uniform) = sum_i p_i log(n p_i)`, the divergence of the weights from the
+# empirical distribution, is at most `epsilon` (here 1 nat). It limits the size of the step.
 #
-# *Stationarity*: the bead arrives in states as often as it is in them. Otherwise the weights would
-# simply choose the samples near the goal, however the bead may get there. In features it reads
-# `B'p = 0`, where row `i` of `B` is
+# *Stationarity*: the distribution of states equals the distribution of successors, restarts
+# included. Without this constraint the weights would select the samples near the goal, whether or
+# not the goal can be reached that often. In features the constraint is `B'p = 0`, where row `i` of
+# `B` is
 #
 # `gamma E[phi(s') | s_i, a_i] + (1 - gamma) mean phi(s0) - phi(s_i)`
 #
-# with the start states `s0`
-# ([`feature_differences`](../src/kreps/algorithms/transition_model.py)). `B` is
-# only an estimate, so a small number `rho` makes the constraint soft.
+# with the start states `s0` ([`feature_differences`](../src/kreps/models/transition.py)). Because
+# `B` is an estimate, the constraint is softened by a ridge `rho`.
 #
-# The constraints have multipliers: a temperature `eta > 0` for the bound, a vector `theta` for
-# stationarity. Both minimise the dual function
+# The Lagrange multipliers are the temperature `eta > 0` for the KL bound and a vector `theta` for
+# stationarity. They minimise the dual function
 #
 # `g(eta, theta) = eta epsilon + eta log( 1/n sum_i exp(delta_i / eta) ) + rho/2 theta'theta`
 #
-# with `delta = R + B theta` (Eqs. 2 and 5), where `R` are the rewards less the largest one, in
-# units of their standard deviation. It is convex, so Newton's method finds its one minimum, the
-# star ([`solve_dual`](../src/kreps/dual.py)).
+# with `delta = R + B theta` (Eqs. 2 and 5), where `R` are the rewards minus the largest one, in
+# units of their standard deviation. The dual is convex, so Newton's method finds its minimum, the
+# star ([`solve_dual`](../src/kreps/algorithms/newton.py)).
 #
-# Left: `g` over the temperature and along the direction of the best vector, `theta*`; each line
-# lies 1.6 times as far above the minimum as the next inner one. Right: `g` and the KL divergence
-# with the best `theta` for each temperature. The slope of the upper curve in `eta` is
-# `epsilon - KL`: it is lowest where KL crosses its bound. The dotted line is a floor under which
-# `eta` is never lowered; here it is not needed.
+# Left: `g` over the temperature and along the direction of the optimal vector, `theta*`. Each
+# contour is 1.6 times as far above the minimum as the next inner one. Right: `g` and the KL
+# divergence, with the optimal `theta` for each temperature. The slope of the upper curve in `eta`
+# is `epsilon - KL`, so its minimum is where KL crosses the bound. The dotted line is the smallest
+# temperature that is permitted (`eta_floor`). It is not active here.
 
 # %%
-own, starts = features[data.state], features[data.start].mean(axis=0)
+starts = features[data.start].mean(axis=0)
 rewards, reward_unit = standardise(data.rewards)
 problem = DualProblem(
     rewards=rewards,
     differences=feature_differences(own, expected, starts, settings.restart_probability),
     kl_bound=settings.kl_bound,
-    ridge=reps.stationarity_ridge(settings, None) / n,
+    ridge=stationarity_ridge(settings, None) / n,
     eta_floor=settings.eta_floor,
 )
 dual = solve_dual(problem)
 
-# With a bound that no weights reach, eta stays at its floor: this gives the best theta at any eta.
+# No weights reach this bound, so eta is at its floor: this gives the optimal theta for any eta.
 etas = np.sort(np.append(dual.eta * np.geomspace(0.1, 6.0, 80), dual.eta))
 no_bound = replace(problem, kl_bound=np.log(n) + 1.0)
 held = [solve_dual(replace(no_bound, eta_floor=eta)) for eta in etas]
@@ -452,33 +467,35 @@ show(figure, "4_dual")
 # %% [markdown]
 # ## 5. Bellman errors, weights and the value function
 #
-# The multiplier `theta` makes a function of the state, the *value function*
-# `V(s) = phi(s)' theta`: how much future reward a state promises, up to a constant
-# ([`KernelExpansion`](../src/kreps/value.py)). So `delta_i` is the Bellman error
-# `r_i + E[V(s') | s_i, a_i] - V(s_i)`, restarts included: what the action brings now and later,
-# compared with what the state promised ([`bellman_errors`](../src/kreps/dual.py)). The weights are
-# (Eq. 1)
+# The multiplier `theta` defines a function of the state, the *value function*
+# `V(s) = phi(s)' theta`: the expected sum of later rewards, up to a constant
+# ([`KernelExpansion`](../src/kreps/kernels/basis.py)). So `delta_i` is the Bellman error
+# `r_i + E[V(s') | s_i, a_i] - V(s_i)`, restarts included: the reward of the action and the value
+# after it, compared with the value before it
+# ([`bellman_errors`](../src/kreps/algorithms/dual.py)). The weights are (Eq. 1)
 #
-# `p_i = exp(delta_i / eta) / sum_j exp(delta_j / eta)` ([`sample_weights`](../src/kreps/dual.py)).
+# `p_i = exp(delta_i / eta) / sum_j exp(delta_j / eta)`
+# ([`sample_weights`](../src/kreps/algorithms/dual.py)).
 #
 # Top left: unlike the rewards, the Bellman errors change from bottom to top. Left of the goal
-# positive velocities are good, right of it negative ones. Top right: the area of a point is its
-# weight. Bottom left: `V` is highest near the goal.
+# positive velocities have the larger errors, right of it negative ones. Top right: the area of a
+# point is its weight. Bottom left: `V` is largest near the goal.
 #
-# Bottom right: what stationarity does. The curve is how often the bead arrives at a place less how
-# often it is there, both seen through the kernel: `phi(s)' B'p`. With weights from rewards alone
-# (`theta = 0`) the bead would be at the goal more often than it arrives there: no policy can do
-# that. With the best `theta` the curve is flat, up to what `rho` allows: `B'p = -rho theta`.
+# Bottom right: the effect of the stationarity constraint. The curve is the density of arrivals
+# minus the density of visits, both smoothed by the kernel: `phi(s)' B'p`. With weights from the
+# rewards alone (`theta = 0`), visits to the goal would exceed arrivals there, which no policy can
+# achieve. With the optimal `theta` the curve is flat up to the softness of the constraint:
+# `B'p = -rho theta`.
 
 # %%
 delta = bellman_errors(problem, dual.theta)
 p = dual.weights
 value = basis.function(reward_unit * dual.theta)  # in units of the reward
-greedy_p = sample_weights(problem.rewards, dual.eta)  # as if there were no future
+greedy_p = sample_weights(problem.rewards, dual.eta)  # without V
 
 
-def exploration_bonus(weights: FloatArray) -> FloatArray:
-    """phi(s)' B'p over the grid: arrivals less visits, seen through the kernel."""
+def net_arrivals(weights: FloatArray) -> FloatArray:
+    """phi(s)' B'p over the grid: arrivals minus visits, smoothed by the kernel."""
     return on_grid @ (problem.differences.T @ weights)
 
 
@@ -499,41 +516,53 @@ with rc_context(STYLE):
     c.set_ylabel("[units of r]")
     c.set_title("Value function V and reward")
     d.axhline(0.0, color=GREY, lw=0.8, ls="--", zorder=0)
-    d.plot(GRID, exploration_bonus(greedy_p), color=GREY, label="weights from rewards alone")
-    d.plot(GRID, exploration_bonus(p), color=BLUE, label="weights with V")
+    d.plot(GRID, net_arrivals(greedy_p), color=GREY, label="weights from rewards alone")
+    d.plot(GRID, net_arrivals(p), color=BLUE, label="weights with V")
     position_axis(d)
     d.legend(loc="upper center")
     d.margins(y=0.25)
-    d.set_title("Arrivals less visits")
+    d.set_title("Arrivals minus visits")
 show(figure, "5_weights")
 
 # %% [markdown]
 # ## 6. The policy
 #
-# The weights say which samples are worth repeating; a policy must say what to do in *every* state.
-# It is a Gaussian process through the weighted samples, in which a sample of weight `w` counts as
-# `w` samples ([`CostSensitiveGP`](../src/kreps/policies.py)):
+# The weights are defined at the samples only; a policy is needed for *every* state. It is a
+# Gaussian process fitted to the weighted samples, in which a sample of weight `w` counts as `w`
+# samples ([`CostSensitiveGP`](../src/kreps/policies/cost_sensitive_gp.py)):
 #
 # `mean(s) = k(s)' C^-1 U` and `sd(s)^2 = sf2 - k(s)' C^-1 k(s) + l` with
 # `C = sf2 K + l diag(1/w)`.
 #
-# `U` are the commanded actions in units of their limit, `K` the kernel values of all pairs of
-# sampled states and `k(s)` those with the state `s`, times `sf2`. `w = p / sum_i p_i^2`. The
-# variances `sf2`, of the mean, and `l`, of the noise, are fitted, like the lengthscale of this
-# kernel ([`policy_hyperparameters`](../src/kreps/algorithms/reps.py)). Samples of next to no
-# weight are left out.
+# `U` are the commanded actions in units of their limit. `K` holds the kernel values of all pairs
+# of sampled states, and `k(s)` those with the state `s`, times `sf2`. The weights are
+# `w = p / sum_i p_i^2`. The variances `sf2` of the mean and `l` of the noise are fitted, and so is
+# the lengthscale of this kernel
+# ([`policy_hyperparameters`](../src/kreps/algorithms/policy_targets.py)). Samples of negligible
+# weight are left out. The exploration noise is at most the variance of the weighted actions
+# ([`exploration_noise`](../src/kreps/algorithms/policy_targets.py)).
 #
 # Left and middle: mean ± 2 standard deviations before and after the update, with the samples
 # (area: weight). The new policy moves towards the goal from both sides. Opposite to the goal both
-# directions are equally good, and its mean passes through zero. The spread is smallest where most
-# of the weight lies; it is the exploration of the next batch. Right: roll-outs of the new policy.
-# The bounded step does not make it perfect; the next update starts from its data. The titles give
-# the average reward per step, from 500 fresh roll-outs each.
+# directions are equally good, and its mean passes through zero. The standard deviation is smallest
+# where most of the weight is; it is the exploration of the next rollouts. Right: rollouts of the
+# new policy. Because the step is bounded, the policy is not yet optimal; the next update starts
+# from its data. The titles give the average reward per step, from 500 further rollouts each.
 
 # %%
-support = reps.PolicyTargets.of(data, p, task)
-policy_x = reps.policy_hyperparameters(support, kernel, settings, None, update_rng)
-policy = reps.fit_policy(support, kernel, task, policy_x)
+targets = PolicyTargets.from_samples(data, p, task)
+x = policy_hyperparameters(targets, kernel, settings.policy_fit, None, update_rng)
+*log_lengthscales, log_signal, log_noise = x
+weights, noise_variance = exploration_noise(targets, float(np.exp(log_noise)))
+policy = CostSensitiveGP(
+    task,
+    kernel.with_lengthscales(np.exp(log_lengthscales)),
+    targets.states,
+    targets.targets,
+    weights,
+    signal=float(np.exp(log_signal)),
+    noise=noise_variance,
+)
 new_rollouts = simulate(policy, args.rollouts, np.random.default_rng([args.seed, 2]))
 fresh = [simulate(each, 500, np.random.default_rng([args.seed, 3])) for each in (explorer, policy)]
 average_before, average_after = (average_reward(each) for each in fresh)
@@ -562,22 +591,23 @@ with rc_context(STYLE):
         axes.set_title(title)
     middle.set_ylabel("")
     draw_rollouts(right, new_rollouts)
-    right.set_title("Roll-outs after")
+    right.set_title("Rollouts after")
     right.set_ylabel("position s [rad]", labelpad=-2)
 show(figure, "6_policy")
 
 # %% [markdown]
 # ## The same in one call
 #
-# The six steps are the body of [`update`](../src/kreps/algorithms/reps.py), which gives the same
-# policy. The numbers printed here belong to the pictures; `V` and the average rewards are in units
-# of the reward. The duality gap is zero at the optimum, up to the tolerance to which KL meets its
-# bound. The seed was picked, among four, for clear pictures; `--seed` and `--rollouts` show
-# others.
+# The six steps are the body of [`reps_step`](../src/kreps/algorithms/reps.py), which
+# [`update`](../src/kreps/algorithms/update.py) calls. It gives the same policy. The numbers printed
+# here belong to the pictures; `V` and the average rewards are in units of the reward. The duality
+# gap is zero at the optimum, up to the tolerance to which KL meets its bound. The seed was selected
+# among four for clear pictures; `--seed` and `--rollouts` give others.
 
 # %%
-start = LearnerState(ReplayWindow(args.rollouts))
-learnt, _ = reps.update(start, rollouts, task, settings, np.random.default_rng([args.seed, 1]))
+start = LearnerState(ReplayWindow(task, args.rollouts))
+same_rng = np.random.default_rng([args.seed, 1])
+learnt, _ = update(start, rollouts, settings, same_rng, Compute())
 assert isinstance(learnt.policy, CostSensitiveGP)
 same = np.array_equal(learnt.policy.mean(GRID[:, None]), policy.mean(GRID[:, None]))
 
@@ -603,4 +633,4 @@ facts = {
 }
 for name, fact in facts.items():
     print(f"{name:48} {fact:.4g}")
-print("kreps.algorithms.reps.update gives", "the same policy" if same else "ANOTHER POLICY")
+print("kreps.algorithms.update.update gives", "the same policy" if same else "ANOTHER POLICY")
