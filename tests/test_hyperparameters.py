@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,7 +32,7 @@ def inputs(n: int, seed: int) -> FloatArray:
 
 
 def embedding_case(n: int, seed: int) -> tuple[EmbeddingLoss, FloatArray, FloatArray]:
-    """The loss, the inputs it is made of, and parameters to judge it at."""
+    """The loss, the inputs that it is made of, and parameters at which to evaluate it."""
     x = inputs(n, seed)
     rng = np.random.default_rng(seed + 100)
     features = np.column_stack([np.sin(x[:, 0]), x[:, 1] * x[:, 2], rng.normal(size=n)])
@@ -131,7 +132,7 @@ def test_the_gradient_of_the_policy_loss_of_means(actions: int, shift: float) ->
 
 @pytest.mark.parametrize("actions", [1, 2])
 def test_means_of_equal_states_have_the_expected_density_of_all_of_them(actions: int) -> None:
-    """Each target is the mean of five actions; all five are judged by those of other states."""
+    """Each target is the mean of five actions, whose densities follow from other states only."""
     loss, x, parameters = policy_case(12, 13, actions)
     rng = np.random.default_rng(14)
     each = rng.uniform(0.2, 1.0, size=(12, 5))
@@ -207,7 +208,7 @@ def test_the_search_lowers_the_loss_to_a_stationary_point() -> None:
 
 
 def test_the_search_recovers_the_lengthscale_of_smooth_data() -> None:
-    # Columns 1 and 2 say nothing: a long lengthscale switches them off.
+    # Columns 1 and 2 are irrelevant: a long lengthscale removes their effect.
     rng = np.random.default_rng(7)
     x = inputs(80, 7)
     features = np.column_stack([np.cos(3.0 * x[:, 0]), np.sin(3.0 * x[:, 0])])
@@ -223,7 +224,9 @@ def test_the_search_recovers_the_lengthscale_of_smooth_data() -> None:
 
 def test_the_search_begins_at_the_best_of_its_starts() -> None:
     loss, _, parameters = embedding_case(60, 15)
-    lost = np.append(np.full(3, -7.0), parameters[-1])  # no two samples alike: nothing is predicted
+    lost = np.append(
+        np.full(3, -7.0), parameters[-1]
+    )  # lengthscales so short that nothing is predicted
     prior = box(parameters, 12.0)
     np.testing.assert_allclose(loss(lost)[1], 0.0, atol=1e-12)
     np.testing.assert_array_equal(minimise(loss, prior, lost), lost)
@@ -243,12 +246,79 @@ def test_the_search_stays_in_its_box(half_width: float) -> None:
     assert np.isin(found, [prior.low, prior.high]).any()  # the minimum lies outside
 
 
+class RecordedLoss:
+    """A function of one parameter with its gradient, and where it was evaluated."""
+
+    def __init__(self, function: Callable[[float], tuple[float, float]]) -> None:
+        self.function, self.asked = function, list[float]()
+
+    def __call__(self, x: FloatArray) -> tuple[float, FloatArray]:
+        self.asked.append(float(x[0]))
+        value, slope = self.function(float(x[0]))
+        return value, np.array([slope])
+
+
+BOX = Prior(np.zeros(1), np.ones(1), np.full(1, -1.0), np.full(1, 2.0), 0.0)
+
+
+def searched(
+    function: Callable[[float], tuple[float, float]], *starts: float
+) -> tuple[float, list[float]]:
+    """Where the search within -1 and 2 ends, and the points that it evaluated."""
+    loss = RecordedLoss(function)
+    points = (np.array([start]) for start in starts)
+    return float(minimise(loss, BOX, *points)[0]), loss.asked  # type: ignore[arg-type]
+
+
 def test_a_start_outside_the_box_is_moved_into_it() -> None:
     loss, _, parameters = embedding_case(30, 9)
     prior = box(parameters, 0.1)
     found = minimise(loss, prior, parameters + 50.0)
     assert (found <= prior.high).all()
     assert loss(found)[0] <= loss(prior.high)[0]
+
+
+@pytest.mark.parametrize(("start", "clipped"), [(-7.0, -1.0), (0.5, 0.5), (9.0, 2.0)])
+def test_a_search_without_slope_ends_at_its_start_clipped_to_the_box(
+    start: float, clipped: float
+) -> None:
+    assert searched(lambda x: (0.0, 0.0), start)[0] == clipped
+    assert searched(lambda x: (0.0, 0.0), start, 1.5)[0] == clipped
+
+
+def test_no_point_outside_the_box_is_evaluated() -> None:
+    for starts in ((-7.0,), (9.0,), (-7.0, 9.0), (9.0, 0.5, -7.0)):
+        found, asked = searched(lambda x: ((x - 30.0) ** 2, 2.0 * (x - 30.0)), *starts)
+        assert found == 2.0
+        assert min(asked) >= -1.0 and max(asked) <= 2.0
+
+
+def test_starts_are_compared_where_they_are_clipped_to() -> None:
+    """Beyond the box the loss is lower than anywhere within; at the edge it is the highest."""
+
+    def stepped(x: float) -> tuple[float, float]:
+        return (-9.0 if x > 2.0 else 3.0 if x == 2.0 else 1.0), 0.0
+
+    assert searched(stepped, 9.0, 0.5)[0] == 0.5
+    assert searched(stepped, 0.5, 9.0)[0] == 0.5
+
+
+def test_the_search_stops_at_its_limit_of_iterations() -> None:
+    def narrow(x: FloatArray) -> tuple[float, FloatArray]:
+        a, b = x  # Rosenbrock's valley, which takes dozens of iterations
+        value = (1.0 - a) ** 2 + 100.0 * (b - a * a) ** 2
+        slopes = [-2.0 * (1.0 - a) - 400.0 * a * (b - a * a), 200.0 * (b - a * a)]
+        return 1e6 * value, 1e6 * np.array(slopes)
+
+    prior = Prior(np.zeros(2), np.ones(2), np.full(2, -9.0), np.full(2, 9.0), 0.0)
+    start = np.array([-1.2, 1.0])
+    values = [
+        narrow(minimise(narrow, prior, start, max_iterations=n))[0]  # type: ignore[arg-type]
+        for n in (1, 5, 30)
+    ]
+    assert values[0] > values[1] > values[2]
+    by_default = minimise(narrow, prior, start)  # type: ignore[arg-type]
+    np.testing.assert_allclose(narrow(by_default)[0], values[2])
 
 
 def test_a_strong_prior_pulls_to_its_centre_and_a_weak_one_does_not() -> None:
@@ -264,7 +334,7 @@ def test_a_strong_prior_pulls_to_its_centre_and_a_weak_one_does_not() -> None:
 
 @dataclass(frozen=True)
 class BrokenBeyond:
-    """A parabola with its minimum at 2.5 that cannot be evaluated beyond 3."""
+    """A convex function with its minimum at 2.5 that cannot be evaluated beyond 3."""
 
     def __call__(self, x: FloatArray) -> tuple[float, FloatArray]:
         if x[0] > 3.0:
