@@ -23,9 +23,9 @@ class Counting(DualProblem):
 
     asked = 0
 
-    def moments(self, eta: float, theta: FloatArray, *, scatter: bool) -> Moments:
-        Counting.asked += scatter
-        return super().moments(eta, theta, scatter=scatter)
+    def moments(self, eta: float, theta: FloatArray, *, with_covariance: bool) -> Moments:
+        Counting.asked += with_covariance
+        return super().moments(eta, theta, with_covariance=with_covariance)
 
 
 def hessians(problem: DualProblem) -> int:

@@ -226,20 +226,20 @@ def test_features_and_functions_agree(outputs: tuple[int, ...], name: str) -> No
 
 
 @pytest.mark.parametrize("eta", [0.1, 5.0])
-@pytest.mark.parametrize("scatter", [True, False])
-def test_moments_agree_and_are_numpys(scatter: bool, eta: float) -> None:
+@pytest.mark.parametrize("with_covariance", [True, False])
+def test_moments_agree_and_are_numpys(with_covariance: bool, eta: float) -> None:
     delta, b = normal(40), normal(40, 6, seed=1)
-    here = Moments.of(delta, b, eta, scatter=scatter)
-    there = Moments.of(strict(delta), strict(b), eta, scatter=scatter)
-    for name in ("top", "log_mass", "below", "kl", "soft_maximum"):
+    here = Moments.from_rows(delta, b, eta, with_covariance=with_covariance)
+    there = Moments.from_rows(strict(delta), strict(b), eta, with_covariance=with_covariance)
+    for name in ("max_delta", "log_mass", "mean_delta", "kl", "soft_maximum"):
         assert getattr(there, name) == pytest.approx(getattr(here, name), rel=1e-12)
-    assert type(there.row) is np.ndarray
-    np.testing.assert_allclose(there.row, here.row, rtol=1e-10)
-    if scatter:
-        assert type(there.scatter) is np.ndarray
-        np.testing.assert_allclose(there.scatter, here.scatter, atol=1e-12)
+    assert type(there.mean_row) is np.ndarray
+    np.testing.assert_allclose(there.mean_row, here.mean_row, rtol=1e-10)
+    if with_covariance:
+        assert type(there.covariance) is np.ndarray
+        np.testing.assert_allclose(there.covariance, here.covariance, atol=1e-12)
     else:
-        assert there.scatter is None
+        assert there.covariance is None
 
 
 def test_sums_agree_and_are_numpy_arrays() -> None:

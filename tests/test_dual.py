@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from operator import add
 
@@ -28,11 +28,11 @@ from kreps.algorithms.dual import (
     standardise,
 )
 from kreps.algorithms.newton import (
-    CENTRED,
+    CENTRED_DECREMENT,
     DECREMENT_TOLERANCE,
     GAP_TOLERANCE,
     KL_TOLERANCE,
-    _newton,
+    minimise_by_newton,
     solve_dual,
 )
 from kreps.kernels.arrays import FloatArray, IntArray
@@ -561,10 +561,12 @@ class InPieces(DualProblem):
             tuple(pieces),
         )
 
-    def moments(self, eta: float, theta: FloatArray, *, scatter: bool) -> Moments:
+    def moments(self, eta: float, theta: FloatArray, *, with_covariance: bool) -> Moments:
         delta = self.bellman_errors(theta)
         parts = [
-            Moments.of(delta[rows], self.differences[rows], eta, scatter=scatter)
+            Moments.from_rows(
+                delta[rows], self.differences[rows], eta, with_covariance=with_covariance
+            )
             for rows in self.pieces
         ]
         return reduce(add, parts)
@@ -625,7 +627,7 @@ def test_the_kl_of_moments_is_that_of_the_weights(eta: float) -> None:
     wanted = kl_from_uniform(sample_weights(delta, eta))
     halves = InPieces.of(problem, cut(80, [33], 0))
     for each in (problem, halves):
-        found = each.moments(eta, theta, scatter=False)
+        found = each.moments(eta, theta, with_covariance=False)
         assert found.samples == 80
         assert found.kl == pytest.approx(wanted, rel=1e-10, abs=1e-12)
         assert found.soft_maximum == pytest.approx(
@@ -635,9 +637,9 @@ def test_the_kl_of_moments_is_that_of_the_weights(eta: float) -> None:
 
 def test_a_covariance_is_made_only_where_it_is_asked_for() -> None:
     pieces = InPieces.of(random_problem(86), cut(80, [10], 0))
-    assert pieces.moments(1.0, np.zeros(7), scatter=False).scatter is None
-    scatter = pieces.moments(1.0, np.zeros(7), scatter=True).scatter
-    assert scatter is not None and scatter.shape == (8, 8)
+    assert pieces.moments(1.0, np.zeros(7), with_covariance=False).covariance is None
+    covariance = pieces.moments(1.0, np.zeros(7), with_covariance=True).covariance
+    assert covariance is not None and covariance.shape == (8, 8)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -662,9 +664,9 @@ def test_the_solution_does_not_depend_on_where_the_solver_starts(seed: int) -> N
     near = solve_dual(half)
     far = np.random.default_rng(seed).normal(size=7)
     for eta, theta in [(near.eta, near.theta), (30.0, np.zeros(7)), (0.2, far)]:
-        end = _newton(problem, eta, theta, 80, eta_free=True)  # whether or not the start is better
+        end = minimise_by_newton(problem, eta, theta, 80)  # whether or not the start is better
         assert end.converged
-        weights = sample_weights(problem.bellman_errors(end.theta), end.eta)
+        weights = sample_weights(problem.bellman_errors(end.point.theta), end.point.eta)
         # What the tolerance of the KL bound leaves open; measured: up to 4e-5.
         np.testing.assert_allclose(weights, cold.weights, atol=1e-4 * cold.weights.max())
     assert_optimal(problem, solve_dual(problem, start=(near.eta, near.theta)))
@@ -693,9 +695,9 @@ def test_the_floor_is_found_from_a_start_at_it_and_from_far_above_it() -> None:
     assert cold.outcome is Outcome.AT_FLOOR
     at_it, above = (problem.eta_floor, 0.0 * cold.theta), (9.0, cold.theta)
     for eta, theta in [(cold.eta, cold.theta), at_it, above]:
-        end = _newton(problem, eta, theta, 80, eta_free=True)
-        assert end.converged and end.eta == problem.eta_floor
-        weights = sample_weights(problem.bellman_errors(end.theta), end.eta)
+        end = minimise_by_newton(problem, eta, theta, 80)
+        assert end.converged and end.point.eta == problem.eta_floor
+        weights = sample_weights(problem.bellman_errors(end.point.theta), end.point.eta)
         np.testing.assert_allclose(weights, cold.weights, atol=1e-5)
 
 
@@ -703,9 +705,9 @@ def test_a_temperature_that_was_too_low_is_left() -> None:
     problem = random_problem(0)
     wanted = solve_dual(problem)
     assert wanted.outcome is Outcome.BOUND_ACTIVE
-    end = _newton(problem, problem.eta_floor + 0.05 * wanted.eta, wanted.theta, 80, eta_free=True)
+    end = minimise_by_newton(problem, problem.eta_floor + 0.05 * wanted.eta, wanted.theta, 80)
     assert end.converged
-    assert end.eta == pytest.approx(wanted.eta, rel=1e-3)
+    assert end.point.eta == pytest.approx(wanted.eta, rel=1e-3)
 
 
 def test_without_features_only_the_temperature_is_found() -> None:
@@ -715,6 +717,65 @@ def test_without_features_only_the_temperature_is_found() -> None:
     assert found.kl == pytest.approx(0.5, abs=1e-4)
 
 
-def test_a_temperature_that_waits_is_never_done() -> None:
-    """`_newton` does not ask for the KL bound then: the decrement alone has to forbid it."""
-    assert CENTRED * MIN_ETA > DECREMENT_TOLERANCE
+def test_a_run_whose_temperature_waits_for_theta_is_not_converged() -> None:
+    """KL is not tested while eta waits, so the decrement has to exceed its tolerance then."""
+    assert CENTRED_DECREMENT * MIN_ETA > DECREMENT_TOLERANCE
+
+
+@dataclass(frozen=True)
+class OneSingularHessian(DualProblem):
+    """Two equal features, whose Hessian block is reported as singular in one of the evaluations.
+
+    Attributes:
+        singular: number of that evaluation, among those with a covariance.
+        temperatures: of those evaluations so far.
+    """
+
+    singular: int = 0
+    temperatures: list[float] = field(default_factory=list)
+
+    def moments(self, eta: float, theta: FloatArray, *, with_covariance: bool) -> Moments:
+        found = super().moments(eta, theta, with_covariance=with_covariance)
+        if not with_covariance:
+            return found
+        self.temperatures.append(eta)
+        if len(self.temperatures) != self.singular:
+            return found
+        assert found.covariance is not None and self.ridge == 0.25
+        covariance = found.covariance.copy()
+        covariance[:2, :2] = eta * (np.ones((2, 2)) - 0.25 * np.eye(2))  # the Hessian is all ones
+        return replace(found, covariance=covariance)
+
+
+@pytest.mark.parametrize(
+    ("max_iterations", "singular", "outcome", "jitter"),
+    [
+        (80, 0, Outcome.BOUND_ACTIVE, 0.0),
+        (80, 1, Outcome.BOUND_ACTIVE, 1e-12),
+        (1, 0, Outcome.FALLBACK, 0.0),
+        (1, 1, Outcome.FALLBACK, 1e-12),
+        (1, 3, Outcome.FALLBACK, 1e-12),
+    ],
+    ids=["never", "first system", "fallback, never", "before the fallback", "in the fallback"],
+)
+def test_the_jitter_of_a_solution_is_the_largest_of_all_its_newton_systems(
+    max_iterations: int, singular: int, outcome: Outcome, jitter: float
+) -> None:
+    column = random_problem(0, r=1).differences
+    problem = OneSingularHessian(
+        random_problem(0).rewards, np.tile(column, (1, 2)), 0.5, 0.25, TINY_FLOOR, singular
+    )
+    found = solve_dual(problem, max_iterations)
+    assert len(problem.temperatures) > singular
+    assert found.outcome is outcome
+    assert found.jitter == jitter
+
+
+def test_every_outcome_has_a_message_and_only_unusual_ones_a_note() -> None:
+    notes = {"": 1, "eta at its floor": 1, "by bisection": 1, "NOT CONVERGED": 1}
+    assert {outcome.note: 1 for outcome in Outcome} == notes
+    assert Outcome.BOUND_ACTIVE.note == ""
+    assert Outcome.NOT_CONVERGED.note == "NOT CONVERGED"
+    for outcome in Outcome:
+        assert outcome == outcome.value
+        assert outcome.startswith("not converged" if outcome.note == "NOT CONVERGED" else "conv")

@@ -1,16 +1,15 @@
-"""Eqs. 1, 2 and 5: the convex dual of the bounded policy update, and its certified solution.
+"""Minimises the dual of Eq. 2: damped Newton's method, with bisection on eta as the fallback.
 
-Every variant of REPS is ``delta = R + B theta``; they differ only in how B came about.  So one
-solver serves them all.  It sees B only through `Moments`, which add up over chunks of the samples:
-the same Newton method runs on a matrix in memory and on a million rows that never are.
-
-The ridge ``rho / 2 |theta|^2`` is not in the paper: without it stationarity is enforced in every
-direction of a rich basis, and the dual need not be bounded.
+Newton's method is a fixed loop: `initial_state`, then `newton_step` until the state is no longer
+running.  A step computes a direction (`newton_direction`), tests whether its Newton decrement is
+small enough (`is_optimal`), and otherwise searches along it (`line_search`).  The temperature is
+kept at or above its floor by projection.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum
 
 import numpy as np
 
@@ -19,42 +18,160 @@ from kreps.algorithms.dual import (
     Moments,
     Outcome,
     Problem,
-    _gradient,
-    _hessian,
-    _primal,
-    _value,
     dual_value,
+    gradient_of,
+    hessian_of,
     kl_from_uniform,
+    penalised_reward,
     sample_weights,
+    value_of,
 )
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.linalg import Cholesky, cholesky
 
+DECREMENT_TOLERANCE = 1e-9
+"""Largest Newton decrement of a solution, in units of the rewards."""
+
+GAP_TOLERANCE = 1e-6
+"""Largest ``|B'p + rho theta|^2 / (2 rho)`` of a solution: its share of the duality gap."""
+
+KL_TOLERANCE = 1e-4
+"""Largest relative deviation of KL from its bound.  All three tolerances have to be met: as eta
+goes to zero the curvature diverges, and the decrement is small far from the optimum."""
+
+CENTRED_DECREMENT = 0.01
+"""Newton decrement in theta, in units of eta, up to which eta is changed together with theta.
+
+``exp(delta / eta)`` is nearly quadratic only where delta changes by less than eta.  If eta falls
+while theta is far from its optimum for that eta, only tiny steps decrease the dual.  The product of
+this constant and `kreps.algorithms.dual.MIN_ETA` exceeds `DECREMENT_TOLERANCE`, so a run in which
+eta still has to change does not count as converged."""
+
+CHORD_MARGIN = 10.0
+"""Factor of a decrement that is computed with the Hessian of the iteration before."""
+
+SUFFICIENT_DECREASE = 1e-4
+"""Smallest decrease of the dual in a line search, as a share of the linear prediction (Armijo)."""
+
+VALUE_RTOL = 1e-14
+"""Increases of the dual below this, relative to its value, are rounding errors."""
+
+MIN_STEP_LENGTH = 1e-12
+"""A line search that is shorter than this share of Newton's step has stalled."""
+
+FLOOR_RTOL = 1e-9
+"""Temperatures closer than this to their floor, relative to it, are set to the floor exactly."""
+
+MAX_ITERATIONS_PER_TEMPERATURE = 100
+MAX_TEMPERATURES = 100
+"""Limits of the fallback: Newton iterations per temperature, and temperatures.  Twenty halvings go
+from 1 to the smallest floor, and the others bisect a factor of two to double precision."""
+
+
+class Status(Enum):
+    """State of a Newton run."""
+
+    RUNNING = "running"
+    CONVERGED = "converged"
+    STALLED = "stalled: no step along the Newton direction decreases the dual"
+
 
 @dataclass(frozen=True)
-class _Progress:
-    """Where a Newton run stands."""
+class Point:
+    """A point of the dual.
+
+    Attributes:
+        eta: temperature.
+        theta: (r,) coordinates of V.
+        moments: at eta and theta.
+        value: of the dual there.
+    """
 
     eta: float
     theta: FloatArray
     moments: Moments
-    decrement: float
-    iterations: int
-    jitter: float
-    converged: bool
+    value: float
 
 
-DECREMENT_TOLERANCE = 1e-9
-GAP_TOLERANCE = 1e-6
-KL_TOLERANCE = 1e-4  # relative to the bound
-"""All three are asked for: the decrement alone lies as eta -> 0, where the curvature explodes."""
+@dataclass(frozen=True)
+class NewtonState:
+    """State of a Newton run.
 
-CENTRED = 0.01
-"""Decrement, in units of eta, above which theta has to be mended before eta may move.
+    Attributes:
+        point: where the run is; its moments include the covariance while the run continues.
+        decrement: half the squared Newton decrement of the latest direction.
+        previous_decrement: at the beginning of the latest iteration; 1 before the first.
+        backtracked: whether the latest line search had to shorten its step.
+        jitter: largest jitter of a Newton system so far.
+        iterations: accepted steps.
+        status: whether the run continues, has converged or has stalled.
+    """
 
-``exp(delta / eta)`` is nearly quadratic only where delta changes by less than eta.  A temperature
-that runs ahead of its theta leaves no step that is both long and downhill.  (Times the least eta it
-exceeds `DECREMENT_TOLERANCE`: a run whose eta still waits is never done.)"""
+    point: Point
+    decrement: float = np.inf
+    previous_decrement: float = 1.0
+    backtracked: bool = False
+    jitter: float = 0.0
+    iterations: int = 0
+    status: Status = Status.RUNNING
+
+    @property
+    def converged(self) -> bool:
+        return self.status is Status.CONVERGED
+
+
+@dataclass(frozen=True)
+class NewtonSystem:
+    """The Hessian at one point.
+
+    Attributes:
+        hessian: (r + 1, r + 1) in ``(theta, eta)``, as of `kreps.algorithms.dual.dual_hessian`.
+        factor: Cholesky factor of its block of theta.
+    """
+
+    hessian: FloatArray
+    factor: Cholesky
+
+    def theta_step(self, g_theta: FloatArray) -> FloatArray:
+        """Newton's step (r,) in theta at fixed eta, from the gradient (r,)."""
+        return -self.factor.solve(g_theta)
+
+    def joint_step(self, theta_step: FloatArray, g_eta: float) -> tuple[FloatArray, float]:
+        """Newton's step in theta (r,) and the relative change of eta, by block elimination.
+
+        Args:
+            theta_step: (r,) at fixed eta.
+            g_eta: gradient in eta, times eta.
+        """
+        mixed, own = self.hessian[:-1, -1], float(self.hessian[-1, -1])
+        coupling = self.factor.solve(mixed)
+        # positive in exact arithmetic; rounding is kept from making the step in eta infinite
+        complement = max(own - float(mixed @ coupling), 1e-12 * own, 1e-300)
+        eta_step = -(g_eta + float(mixed @ theta_step)) / complement
+        return theta_step - eta_step * coupling, eta_step
+
+
+@dataclass(frozen=True)
+class Direction:
+    """Newton's direction at one point.
+
+    Attributes:
+        theta_step: (r,) change of theta.
+        eta_step: relative change of eta; zero where eta is not changed.
+        moves_eta: whether eta is changed.
+        at_floor: whether eta is at its floor.
+        gradient: (g_eta, g_theta) at the point.
+        slope: derivative of the dual along the direction: minus the squared Newton decrement.
+        system: the Hessian.
+    """
+
+    theta_step: FloatArray
+    eta_step: float
+    moves_eta: bool
+    at_floor: bool
+    gradient: tuple[float, FloatArray]
+    slope: float
+    system: NewtonSystem
 
 
 def solve_dual(
@@ -62,45 +179,58 @@ def solve_dual(
     max_iterations: int = 80,
     start: tuple[float, FloatArray] | None = None,
 ) -> DualSolution:
-    """Minimise the dual over eta >= floor and theta: damped Newton, with bisection to fall back on.
+    """Minimise the dual over ``eta >= eta_floor`` and theta.
 
     Args:
-        problem: the update's data.
-        max_iterations: of the joint Newton method before the fallback takes over.
-        start: eta and theta to start from where that is better than to know nothing, such as the
-            solution for a part of the samples.
+        problem: data of the update.
+        max_iterations: of Newton's method, before the fallback is used.
+        start: eta and theta (r,) from which the run starts if the dual is smaller there than at
+            theta = 0, such as the solution for a part of the samples.
+
+    Returns:
+        The solution with its certificate.  ``outcome`` says whether and how the run converged.
     """
-    # Where all rewards agree nothing can be gained: the temperature belongs to its floor.
-    eta = max(1.0, problem.eta_floor) if problem.rewards.any() else problem.eta_floor
-    theta = np.zeros(problem.rank)
-    if start is not None:
-        given = max(start[0], problem.eta_floor), start[1]
-        # the dual where V is zero: delta is R, so it needs no pass over the features
-        nothing = eta * (problem.kl_bound + float(np.log(np.mean(np.exp(problem.rewards / eta)))))
-        if dual_value(problem, *given) <= nothing:
-            eta, theta = given
-    end = _newton(problem, eta, theta, max_iterations, eta_free=True)
+    end = minimise_by_newton(problem, *starting_point(problem, start), max_iterations)
     outcome = Outcome.BOUND_ACTIVE
     if not end.converged:
-        end = _bisection(problem, end)
+        end = bisect_temperature(problem, end)
         outcome = Outcome.FALLBACK if end.converged else Outcome.NOT_CONVERGED
-    if end.converged and end.eta <= problem.eta_floor:
+    if end.converged and end.point.eta <= problem.eta_floor:
         outcome = Outcome.AT_FLOOR
-    return _certify(problem, end, outcome)
+    return certify(problem, end, outcome)
 
 
-def _certify(problem: Problem, end: _Progress, outcome: Outcome) -> DualSolution:
-    weights = sample_weights(problem.bellman_errors(end.theta), end.eta)
+def starting_point(
+    problem: Problem, start: tuple[float, FloatArray] | None
+) -> tuple[float, FloatArray]:
+    """Eta and theta (r,) to start from: those given if the dual is smaller there than at theta = 0.
+
+    If all rewards are equal, no policy is better than another, and eta starts at its floor.
+    """
+    eta = max(1.0, problem.eta_floor) if problem.rewards.any() else problem.eta_floor
+    theta = np.zeros(problem.rank)
+    if start is None:
+        return eta, theta
+    given = max(start[0], problem.eta_floor), start[1]
+    # the dual at theta = 0, where delta is R: this needs no pass over the features
+    at_zero = eta * (problem.kl_bound + float(np.log(np.mean(np.exp(problem.rewards / eta)))))
+    return given if dual_value(problem, *given) <= at_zero else (eta, theta)
+
+
+def certify(problem: Problem, end: NewtonState, outcome: Outcome) -> DualSolution:
+    """The solution at the end of a run, with primal value, KL and residuals."""
+    point = end.point
+    weights = sample_weights(problem.bellman_errors(point.theta), point.eta)
     kl = kl_from_uniform(weights)
-    primal = _primal(problem, weights, end.moments.row)
-    if outcome is Outcome.AT_FLOOR:  # the temperature is a given price of KL, not a multiplier
-        primal += end.eta * (problem.kl_bound - kl)
-    _, g_theta = _gradient(problem, end.theta, end.moments)
+    primal = penalised_reward(problem, weights, point.moments.mean_row)
+    if outcome is Outcome.AT_FLOOR:  # here eta is a given price of KL, no Lagrange multiplier
+        primal += point.eta * (problem.kl_bound - kl)
+    _, g_theta = gradient_of(problem, point.theta, point.moments)
     return DualSolution(
-        eta=end.eta,
-        theta=end.theta,
+        eta=point.eta,
+        theta=point.theta,
         weights=weights,
-        dual=_value(problem, end.theta, end.moments),
+        dual=value_of(problem, point.theta, point.moments),
         primal=primal,
         kl=kl,
         decrement=end.decrement,
@@ -111,127 +241,217 @@ def _certify(problem: Problem, end: _Progress, outcome: Outcome) -> DualSolution
     )
 
 
-def _newton(
-    problem: Problem, eta: float, theta: FloatArray, max_iterations: int, *, eta_free: bool
-) -> _Progress:
-    """Damped Newton from ``(eta, theta)``, projected on ``eta >= floor``; or in theta alone.
-
-    Eta waits until theta is `CENTRED`, so that the run follows the path of best thetas.
-    """
-    floor = problem.eta_floor
-    here = problem.moments(eta, theta, scatter=True)
-    value = _value(problem, theta, here)
-    decrement, before, jitter = np.inf, 1.0, 0.0
-    shortened = False
-    for iteration in range(max_iterations):
-        g_eta, g_theta = _gradient(problem, theta, here)
-        hessian = _hessian(problem, here)
-        factor = cholesky(hessian[:-1, :-1])
-        jitter = max(jitter, factor.jitter)
-        step, stretch = -factor.solve(g_theta), 0.0  # the latter a relative change of eta
-        at_floor = eta <= floor
-        centred = -0.5 * float(g_theta @ step) <= CENTRED * eta
-        moves_eta = eta_free and centred and not (at_floor and g_eta >= 0)
-        if moves_eta:
-            both, change = _joint_step(factor, hessian, step, eta * g_eta)
-            moves_eta = not (at_floor and change < 0)
-            if moves_eta:
-                step, stretch = both, change
-        slope = float(g_theta @ step) + eta * g_eta * stretch
-        decrement = -0.5 * slope
-        if _done(problem, g_eta if moves_eta else 0.0, g_theta, decrement):
-            return _Progress(eta, theta, here, decrement, iteration, jitter, True)
-        # eta at most halves or doubles, and never passes its floor
-        most = 1.0 if stretch > 0.0 else max(0.5, floor / eta) - 1.0
-        length = min(1.0, most / stretch) if stretch else 1.0
-        rounding = 1e-14 * max(1.0, abs(value))
-        # The first try is good enough where the one before was, so its curvature is taken in the
-        # same pass; but where it should be the last, converging as fast as before, none is needed.
-        expected = decrement * min(1.0, decrement / before)
-        before = decrement
-        scatter = not shortened and 10.0 * expected > DECREMENT_TOLERANCE
-        shortened = False
-        while length > 1e-12:
-            new_eta = max(eta * (1.0 + length * stretch), floor)
-            if new_eta <= floor * (1.0 + 1e-9):
-                new_eta = floor  # exactly, not a rounding error above it
-            new_theta = theta + length * step
-            there = problem.moments(new_eta, new_theta, scatter=scatter)
-            new_value = _value(problem, new_theta, there)
-            if new_value <= value + 1e-4 * length * slope + rounding:
-                break
-            length *= 0.5
-            scatter, shortened = False, True
-        else:
-            return _Progress(eta, theta, here, decrement, iteration, jitter, False)
-        eta, theta, value, here = new_eta, new_theta, new_value, there
-        if here.scatter is None:
-            g_eta, g_theta = _gradient(problem, theta, here)
-            step, stretch = -factor.solve(g_theta), 0.0
-            if moves_eta:
-                step, stretch = _joint_step(factor, hessian, step, eta * g_eta)
-            decrement = -0.5 * (float(g_theta @ step) + eta * g_eta * stretch)
-            # by the last Hessian, hence the margin; where eta comes to its floor or leaves it, no
-            settled = eta > floor if moves_eta else (at_floor and g_eta >= 0) or not eta_free
-            if settled and _done(problem, g_eta if moves_eta else 0.0, g_theta, 10.0 * decrement):
-                return _Progress(eta, theta, here, decrement, iteration + 1, jitter, True)
-            here = problem.moments(eta, theta, scatter=True)
-    return _Progress(eta, theta, here, decrement, max_iterations, jitter, False)
-
-
-def _joint_step(
-    factor: Cholesky, hessian: FloatArray, step: FloatArray, g_eta: float
-) -> tuple[FloatArray, float]:
-    """Newton's step in theta (r,) and eta, from that in theta alone: the last row eliminated.
+def minimise_by_newton(
+    problem: Problem,
+    eta: float,
+    theta: FloatArray,
+    max_iterations: int,
+    *,
+    fixed_eta: bool = False,
+) -> NewtonState:
+    """Damped Newton's method from eta and theta (r,).
 
     Args:
-        factor: of the block of theta.
-        hessian: (r + 1, r + 1) whole.
-        step: (r,) in theta alone.
-        g_eta: gradient in the scaled eta.
+        problem: data of the update.
+        eta: first temperature, at or above the floor.
+        theta: (r,) first coordinates of V.
+        max_iterations: largest number of steps.
+        fixed_eta: whether only theta is changed.
     """
-    mixed, own = hessian[:-1, -1], float(hessian[-1, -1])
-    pulled = factor.solve(mixed)  # how far theta has to go back for eta
-    complement = max(own - float(mixed @ pulled), 1e-12 * own, 1e-300)
-    stretch = -(g_eta + float(mixed @ step)) / complement
-    return step - stretch * pulled, stretch
+    state = initial_state(problem, eta, theta)
+    while state.status is Status.RUNNING and state.iterations < max_iterations:
+        state = newton_step(problem, state, fixed_eta=fixed_eta)
+    return state
 
 
-def _done(problem: Problem, g_eta: float, g_theta: FloatArray, decrement: float) -> bool:
-    """Whether a gradient and its Newton decrement are small enough."""
+def initial_state(problem: Problem, eta: float, theta: FloatArray) -> NewtonState:
+    """The state of a run before its first step."""
+    return NewtonState(evaluate(problem, eta, theta, with_covariance=True))
+
+
+def evaluate(problem: Problem, eta: float, theta: FloatArray, *, with_covariance: bool) -> Point:
+    """The dual at eta and theta (r,): one pass over the samples."""
+    moments = problem.moments(eta, theta, with_covariance=with_covariance)
+    return Point(eta, theta, moments, value_of(problem, theta, moments))
+
+
+def newton_step(problem: Problem, state: NewtonState, *, fixed_eta: bool) -> NewtonState:
+    """One iteration: direction, termination test, line search.
+
+    If the line search did not compute the covariance at the new point, convergence is tested with
+    the Hessian of the old point first, and the covariance is computed only if the run continues.
+    """
+    direction = newton_direction(problem, state.point, fixed_eta=fixed_eta)
+    decrement = -0.5 * direction.slope
+    jitter = max(state.jitter, direction.system.factor.jitter)
+    state = replace(state, decrement=decrement, jitter=jitter)
+    g_eta, g_theta = direction.gradient
+    if is_optimal(problem, g_eta if direction.moves_eta else 0.0, g_theta, decrement):
+        return replace(state, status=Status.CONVERGED)
+    found = line_search(problem, state, direction)
+    if found is None:
+        return replace(state, status=Status.STALLED)
+    point, backtracked = found
+    state = replace(
+        state,
+        point=point,
+        previous_decrement=decrement,
+        backtracked=backtracked,
+        iterations=state.iterations + 1,
+    )
+    if point.moments.covariance is not None:
+        return state
+    state = check_by_chord(problem, state, direction, fixed_eta=fixed_eta)
+    if state.converged:
+        return state
+    moments = problem.moments(point.eta, point.theta, with_covariance=True)
+    return replace(state, point=replace(point, moments=moments))
+
+
+def newton_direction(problem: Problem, point: Point, *, fixed_eta: bool) -> Direction:
+    """Newton's direction in theta, and in eta too once theta is nearly optimal for its eta.
+
+    Eta waits until theta is centred (`CENTRED_DECREMENT`), so that the run follows the path of
+    optimal theta.  At its floor eta is not decreased any further.
+    """
+    eta, at_floor = point.eta, point.eta <= problem.eta_floor
+    g_eta, g_theta = gradient_of(problem, point.theta, point.moments)
+    hessian = hessian_of(problem, point.moments)
+    system = NewtonSystem(hessian, cholesky(hessian[:-1, :-1]))
+    theta_step, eta_step = system.theta_step(g_theta), 0.0
+    centred = -0.5 * float(g_theta @ theta_step) <= CENTRED_DECREMENT * eta
+    moves_eta = not fixed_eta and centred and not (at_floor and g_eta >= 0)
+    if moves_eta:
+        joint = system.joint_step(theta_step, eta * g_eta)
+        moves_eta = not (at_floor and joint[1] < 0)
+        if moves_eta:
+            theta_step, eta_step = joint
+    slope = float(g_theta @ theta_step) + eta * g_eta * eta_step
+    return Direction(theta_step, eta_step, moves_eta, at_floor, (g_eta, g_theta), slope, system)
+
+
+def is_optimal(problem: Problem, g_eta: float, g_theta: FloatArray, decrement: float) -> bool:
+    """Whether decrement, stationarity and KL are within their tolerances.
+
+    Args:
+        problem: data of the update.
+        g_eta: ``epsilon - KL``, or zero where eta is not changed.
+        g_theta: (r,) gradient in theta.
+        decrement: half the squared Newton decrement.
+    """
     gap = float(g_theta @ g_theta) / (2.0 * problem.ridge)
     kl_met = abs(g_eta) <= KL_TOLERANCE * problem.kl_bound
     return decrement <= DECREMENT_TOLERANCE and gap <= GAP_TOLERANCE and kl_met
 
 
-def _bisection(problem: Problem, stalled: _Progress) -> _Progress:
-    """Newton in theta along a path of temperatures: slow and sure, as KL falls with eta.
+def line_search(
+    problem: Problem, state: NewtonState, direction: Direction
+) -> tuple[Point, bool] | None:
+    """The first of the halved steps that decreases the dual enough, and whether any was halved.
 
-    From eta = 1 the temperature is halved (or doubled) until the KL bound is passed, then
-    bisected in the logarithm.  Each solve starts from the one before, so none has far to go.
+    In one step eta at most halves or doubles, and it does not pass its floor.
+
+    Returns:
+        None if no step is long enough (`MIN_STEP_LENGTH`).
+    """
+    here, floor, eta_step = state.point, problem.eta_floor, direction.eta_step
+    max_eta_step = 1.0 if eta_step > 0.0 else max(0.5, floor / here.eta) - 1.0
+    length = min(1.0, max_eta_step / eta_step) if eta_step else 1.0
+    rounding = VALUE_RTOL * max(1.0, abs(here.value))
+    with_covariance, backtracked = first_trial_needs_covariance(state), False
+    while length > MIN_STEP_LENGTH:
+        eta = max(here.eta * (1.0 + length * eta_step), floor)
+        if eta <= floor * (1.0 + FLOOR_RTOL):
+            eta = floor
+        theta = here.theta + length * direction.theta_step
+        there = evaluate(problem, eta, theta, with_covariance=with_covariance)
+        decrease = SUFFICIENT_DECREASE * length * direction.slope
+        if there.value <= here.value + decrease + rounding:
+            return there, backtracked
+        length *= 0.5
+        with_covariance, backtracked = False, True
+    return None
+
+
+def first_trial_needs_covariance(state: NewtonState) -> bool:
+    """Whether the first trial point of a line search is likely to be where the next step starts.
+
+    Then its covariance is computed in the same pass over the samples as its value.  It is not if
+    the last line search rejected its first trial point, nor if the run is expected to end there,
+    with the decrement falling by the same factor as in the last iteration.
+    """
+    ratio = min(1.0, state.decrement / state.previous_decrement)
+    return not state.backtracked and CHORD_MARGIN * state.decrement * ratio > DECREMENT_TOLERANCE
+
+
+def check_by_chord(
+    problem: Problem, state: NewtonState, direction: Direction, *, fixed_eta: bool
+) -> NewtonState:
+    """Checks convergence with the gradient of the new point and the Hessian of the old one.
+
+    The decrement is multiplied by `CHORD_MARGIN`, as the Hessian is not the one of the new point.
+    Where eta has just come to its floor, or could leave it, the test is not made.
+
+    Args:
+        problem: data of the update.
+        state: after the line search.
+        direction: along which it searched.
+        fixed_eta: whether only theta is changed.
+    """
+    point, system = state.point, direction.system
+    g_eta, g_theta = gradient_of(problem, point.theta, point.moments)
+    theta_step, eta_step = system.theta_step(g_theta), 0.0
+    if direction.moves_eta:
+        theta_step, eta_step = system.joint_step(theta_step, point.eta * g_eta)
+    decrement = -0.5 * (float(g_theta @ theta_step) + point.eta * g_eta * eta_step)
+    state = replace(state, decrement=decrement)
+    if direction.moves_eta:
+        same_constraints = point.eta > problem.eta_floor
+    else:
+        same_constraints = (direction.at_floor and g_eta >= 0) or fixed_eta
+    kl_excess = g_eta if direction.moves_eta else 0.0
+    if same_constraints and is_optimal(problem, kl_excess, g_theta, CHORD_MARGIN * decrement):
+        return replace(state, status=Status.CONVERGED)
+    return state
+
+
+def bisect_temperature(problem: Problem, stalled: NewtonState) -> NewtonState:
+    """The fallback: minimises over theta at fixed temperatures; KL decreases with eta.
+
+    From eta = 1 the temperature is halved (or doubled) until KL has passed its bound, then bisected
+    in its logarithm.  Each minimisation starts from the solution of the one before.
+
+    Args:
+        problem: data of the update.
+        stalled: end of the run of Newton's method, whose iterations and jitter are included.
     """
     eta, theta = max(1.0, problem.eta_floor), np.zeros(problem.rank)
-    low, high = 0.0, np.inf  # KL is too large at low, too small at high
+    low, high = 0.0, np.inf  # KL exceeds its bound at low and is below it at high
     iterations, jitter, end = stalled.iterations, stalled.jitter, stalled
-    for _ in range(100):
-        end = _newton(problem, eta, theta, 100, eta_free=False)
-        theta = end.theta
+    for _ in range(MAX_TEMPERATURES):
+        end = minimise_by_newton(
+            problem, eta, theta, MAX_ITERATIONS_PER_TEMPERATURE, fixed_eta=True
+        )
+        theta = end.point.theta
         iterations += end.iterations
         jitter = max(jitter, end.jitter)
-        g_eta = problem.kl_bound - end.moments.kl
+        end = replace(end, iterations=iterations, jitter=jitter)
+        g_eta = problem.kl_bound - end.point.moments.kl
         at_floor = eta <= problem.eta_floor and g_eta >= 0
         if at_floor or abs(g_eta) <= KL_TOLERANCE * problem.kl_bound:
-            return _Progress(
-                eta, theta, end.moments, end.decrement, iterations, jitter, end.converged
-            )
+            return end
         if g_eta < 0:
             low = eta
         else:
             high = eta
-        if np.isinf(high):
-            eta *= 2.0
-        elif low == 0.0:
-            eta = max(0.5 * eta, problem.eta_floor)
-        else:
-            eta = float(np.sqrt(low * high))
-    return _Progress(eta, theta, end.moments, end.decrement, iterations, jitter, False)
+        eta = next_temperature(low, high, eta, problem.eta_floor)
+    return replace(end, status=Status.STALLED)
+
+
+def next_temperature(low: float, high: float, eta: float, floor: float) -> float:
+    """The next temperature of the bisection, from the bracket (0 and infinity if still open)."""
+    if np.isinf(high):
+        return 2.0 * eta
+    if low == 0.0:
+        return max(0.5 * eta, floor)
+    return float(np.sqrt(low * high))

@@ -4,14 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from kreps.algorithms.dual import DualSolution, Outcome
+from kreps.algorithms.dual import DualSolution
 from kreps.kernels.arrays import FloatArray
-
-_NOTES = {
-    Outcome.AT_FLOOR: "eta at its floor",
-    Outcome.FALLBACK: "by bisection",
-    Outcome.NOT_CONVERGED: "NOT CONVERGED",
-}
 
 
 @dataclass(frozen=True)
@@ -79,7 +73,7 @@ class UpdateInfo:
             "eta": f"{self.dual.eta:.3g}",
             "ESS": f"{self.effective_samples:.0f}",
             "gap": f"{self.dual.gap:.0e}",
-            "note": f"{_NOTES.get(self.dual.outcome, '')}"
+            "note": f"{self.dual.outcome.note}"
             + ("  refused: the policy before acts" if self.rejected else "")
             + (f"  jitter {self.jitter:.0e}" if self.jitter else ""),
         }

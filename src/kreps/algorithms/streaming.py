@@ -229,12 +229,12 @@ class ChunkMoments:
     rows: BellmanRows
     eta: float
     theta: FloatArray
-    scatter: bool
+    with_covariance: bool
 
     def __call__(self, chunk: Chunk, rewards: FloatArray) -> Moments:
         b = self.rows(chunk.load().transitions)
         delta = like(rewards, b) + b @ like(self.theta, b)
-        return Moments.of(delta, b, self.eta, scatter=self.scatter)
+        return Moments.from_rows(delta, b, self.eta, with_covariance=self.with_covariance)
 
 
 @dataclass(frozen=True)
@@ -283,8 +283,8 @@ class StreamedProblem:
     def bellman_errors(self, theta: FloatArray) -> FloatArray:
         return np.concatenate(list(self._map(ChunkErrors(self.rows, theta))))
 
-    def moments(self, eta: float, theta: FloatArray, *, scatter: bool) -> Moments:
-        return reduce(add, self._map(ChunkMoments(self.rows, eta, theta, scatter)))
+    def moments(self, eta: float, theta: FloatArray, *, with_covariance: bool) -> Moments:
+        return reduce(add, self._map(ChunkMoments(self.rows, eta, theta, with_covariance)))
 
     def _map(self, function: Callable[[Chunk, FloatArray], Result]) -> Iterator[Result]:
         return self.compute.map(function, self.dataset.chunks, self.dataset.split(self.rewards))
