@@ -21,7 +21,7 @@ from kreps.learning.learner import IterationReport
 
 TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 NAME = "kreps/SwingUp-v0"
-COMMAND = [sys.executable, "-m", "kreps.cli"]
+COMMAND = [sys.executable, "-m", "kreps.app.cli"]
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
@@ -85,8 +85,8 @@ def ten_in_one_go(tmp_path_factory: pytest.TempPathFactory) -> Path:
     "settings",
     [
         {},
-        {"recipe": "observed", "model": "sample"},
-        {"features": "grid"},
+        {"preset": "single_step", "model": "sample"},
+        {"value": "grid"},
         {"policy_fit": "bounded"},
     ],
 )
@@ -134,7 +134,7 @@ def test_a_run_stopped_before_any_of_its_writes_goes_on_as_if_never_stopped(
             return kreps.KREPS.resume(run.checkpoint_file, env)
         return kreps.KREPS(env, seed=3, **TINY)
 
-    config = RunConfig(NAME, 2, 3, "default", TINY, None)
+    config = RunConfig(NAME, 2, 3, "model_based", TINY, None)
     whole = RunFolder(tmp_path / "whole")
     whole.create(config)
     learner(whole).learn(2, callback=whole, progress=False)
@@ -166,7 +166,7 @@ def test_a_run_stopped_before_any_of_its_writes_goes_on_as_if_never_stopped(
 
 def test_a_checkpoint_is_written_after_every_iteration(tmp_path: Path) -> None:
     run = RunFolder(tmp_path / "run")
-    run.create(RunConfig(NAME, 3, 0, "default", TINY, None))
+    run.create(RunConfig(NAME, 3, 0, "model_based", TINY, None))
     seen: list[int] = []
 
     def look(learner: kreps.KREPS, report: IterationReport) -> None:
@@ -214,7 +214,7 @@ def test_ctrl_c_leaves_a_run_that_can_be_resumed(tmp_path: Path) -> None:
     assert total >= 4  # the third may have been shown but not yet written
     call(resume(run, total))
     untouched = RunFolder(tmp_path / "untouched")
-    untouched.create(RunConfig(NAME, total, 3, "default", TINY, None))
+    untouched.create(RunConfig(NAME, total, 3, "model_based", TINY, None))
     kreps.KREPS(gym.make(NAME), seed=3, **TINY).learn(total, callback=untouched, progress=False)
     assert_same_run(run, untouched.path, total)
 
