@@ -12,7 +12,7 @@ demo: .venv/installed           ## learn the swing-up; pictures and policy in ru
 test: .venv/installed           ## all tests, in under ten minutes on two cores
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
-check: .venv/installed          ## formatter, linter, types, floors
+check: .venv/installed          ## formatter, linter, types, imports
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
