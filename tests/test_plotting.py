@@ -15,7 +15,12 @@ from PIL import Image
 
 import kreps
 from kreps import plotting
-from kreps.app import plots
+from kreps.app.environments import Labels
+from kreps.app.plots.film import Recording
+from kreps.app.plots.film import film as draw_film
+from kreps.app.plots.learning_curve import learning_curve
+from kreps.app.plots.plane import path_of
+from kreps.app.plots.policy_maps import policy_maps
 from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.envs.references import REFERENCE_REWARDS
@@ -23,7 +28,7 @@ from kreps.errors import ConfigurationError
 from kreps.experiments import plots as experiment_plots
 
 REFERENCES = REFERENCE_REWARDS["kreps/SwingUp-v0"]
-LABELS = (["angle", "velocity"], ["torque"])
+LABELS = Labels(["angle", "velocity"], ["torque"])
 EVALUATION = {"stochastic": {"mean": -30.0}, "greedy": {"mean": -25.0}}
 
 
@@ -55,30 +60,25 @@ def texts(figure: Figure) -> str:
 
 
 def maps(learner: kreps.KREPS) -> Figure:
-    return plots.policy_maps(learner.state, learner.task, *LABELS)
+    return policy_maps(learner.state, learner.task, LABELS)
 
 
-def film(learner: kreps.KREPS, path: Path, steps: int = 5, **changes: Any) -> Path:
+def film(learner: kreps.KREPS, path: Path, steps: int = 5, labels: Labels = LABELS) -> Path:
     rng = np.random.default_rng(0)
-    arguments: dict[str, Any] = {
-        "frames": [rng.integers(0, 255, (24, 24, 3), dtype=np.uint8) for _ in range(steps)],
-        "observations": rng.normal(size=(steps, learner.task.observation_size)),
-        "actions": rng.normal(size=(steps, learner.task.action_size)),
-        "state": learner.state,
-        "task": learner.task,
-        "labels": LABELS[0],
-        "action_labels": LABELS[1],
-        "fps": 20.0,
-        "path": path,
-    }
-    return plots.film(**{**arguments, **changes})
+    recording = Recording(
+        frames=[rng.integers(0, 255, (24, 24, 3), dtype=np.uint8) for _ in range(steps)],
+        observations=rng.normal(size=(steps, learner.task.observation_size)),
+        actions=rng.normal(size=(steps, learner.task.action_size)),
+        fps=20.0,
+    )
+    return draw_film(recording, learner.state, learner.task, labels, path)
 
 
 # ---- learning curve ---------------------------------------------------------------------------
 
 
 def test_the_curve_shows_each_batch_at_the_data_its_policy_was_learnt_from() -> None:
-    figure = plots.learning_curve(rows(3), {}, None, "title")
+    figure = learning_curve(rows(3), {}, None, "title")
     top, middle, bottom = figure.axes
     np.testing.assert_array_equal(top.lines[0].get_xdata(), [0.0, 100.0, 200.0])
     np.testing.assert_array_equal(top.lines[0].get_ydata(), [-90.0, -80.0, -70.0])
@@ -89,7 +89,7 @@ def test_the_curve_shows_each_batch_at_the_data_its_policy_was_learnt_from() -> 
 
 
 def test_the_curve_names_every_reference_value_and_the_evaluation() -> None:
-    figure = plots.learning_curve(rows(3), REFERENCES, EVALUATION, "title")
+    figure = learning_curve(rows(3), REFERENCES, EVALUATION, "title")
     top = figure.axes[0]
     said = texts(figure)
     levels = [float(np.asarray(line.get_ydata())[0]) for line in top.lines]
@@ -108,7 +108,7 @@ def test_the_curve_names_every_reference_value_and_the_evaluation() -> None:
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_short_runs_have_a_curve_too(count: int, tmp_path: Path) -> None:
-    figure = plots.learning_curve(rows(count), REFERENCES, EVALUATION, "short")
+    figure = learning_curve(rows(count), REFERENCES, EVALUATION, "short")
     path = plotting.save(figure, tmp_path / "curve.png")
     with Image.open(path) as picture:
         picture.load()
@@ -116,7 +116,7 @@ def test_short_runs_have_a_curve_too(count: int, tmp_path: Path) -> None:
 
 
 def test_the_names_of_reference_lines_do_not_overlap() -> None:
-    figure = plots.learning_curve(rows(3), REFERENCES, EVALUATION, "title")
+    figure = learning_curve(rows(3), REFERENCES, EVALUATION, "title")
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     boxes = [t.get_window_extent(canvas.get_renderer()) for t in figure.axes[0].texts]
@@ -131,7 +131,7 @@ def test_drawing_leaves_the_settings_of_others_alone(learnt: kreps.KREPS, tmp_pa
     from matplotlib import rcParams
 
     before = dict(rcParams)
-    plotting.save(plots.learning_curve(rows(2), {}, None, ""), tmp_path / "a.png")
+    plotting.save(learning_curve(rows(2), {}, None, ""), tmp_path / "a.png")
     plotting.save(maps(learnt), tmp_path / "b.png")
     film(learnt, tmp_path / "c.gif", 2)
     assert dict(rcParams) == before
@@ -168,13 +168,13 @@ def test_the_maps_show_policy_and_value_over_the_plane(learnt: kreps.KREPS, tmp_
     assert plotting.save(figure, tmp_path / "maps.png").stat().st_size > 10_000
 
 
-def test_the_maps_draw_the_latest_roll_outs_without_lines_across_the_cut() -> None:
+def test_the_maps_draw_the_latest_rollouts_without_lines_across_the_cut() -> None:
     task = TaskSpec(2, [-1.0], [1.0], (0,))
     observations = np.array([[4.4, 1.0], [4.6, 1.0], [-1.5, 1.0], [-1.3, 1.0]])
-    x, y = plots._unwrapped(observations, task)
+    x, y = path_of(observations, task)
     assert len(x) == 5 and np.isnan(x[2]) and np.isnan(y[2])
     np.testing.assert_array_equal(x[[0, 1, 3, 4]], observations[:, 0])
-    plain = plots._unwrapped(observations, TaskSpec(2, [-1.0], [1.0]))
+    plain = path_of(observations, TaskSpec(2, [-1.0], [1.0]))
     np.testing.assert_array_equal(plain, observations.T)  # a jump of a length is a jump
 
 
@@ -216,7 +216,7 @@ def test_a_film_of_other_states_shows_the_camera_only(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     learner = kreps.KREPS(TaskSpec(3, [-1.0], [1.0]))
     learner.update([Rollout(rng.normal(size=(6, 3)), rng.normal(size=(5, 1)), rng.normal(size=5))])
-    path = film(learner, tmp_path / "a.gif", 2, labels=["a", "b", "c"])
+    path = film(learner, tmp_path / "a.gif", 2, labels=Labels(["a", "b", "c"], ["d"]))
     with Image.open(path) as pictures:
         assert pictures.n_frames == 2
 

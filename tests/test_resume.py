@@ -21,7 +21,7 @@ from kreps.learning.learner import IterationReport
 
 TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 NAME = "kreps/SwingUp-v0"
-COMMAND = [sys.executable, "-m", "kreps.app.cli"]
+COMMAND = [sys.executable, "-m", "kreps"]
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
 ENVIRONMENT = {**os.environ, "OPENBLAS_NUM_THREADS": "1"}
 
@@ -209,7 +209,7 @@ def test_ctrl_c_leaves_a_run_that_can_be_resumed(tmp_path: Path) -> None:
     said = process.communicate(timeout=60)[0]
     assert process.returncode == 130
     assert "Traceback" not in said
-    assert "go on with: kreps resume" in " ".join(said.split())
+    assert "continue with: kreps resume" in " ".join(said.split())
     total = len(rows(run)) + 2
     assert total >= 4  # the third may have been shown but not yet written
     call(resume(run, total))
@@ -234,7 +234,7 @@ def test_a_run_killed_at_twenty_random_moments_gives_the_bytes_of_an_untouched_o
         assert process.stdout is not None
         if kill % 3 == 0:  # anywhere from the first import to the first iterations
             time.sleep(rng.uniform(0.0, 1.3) * start_up)
-        else:  # in roll-outs, updates and writing, one to three iterations later
+        else:  # in rollouts, updates and writing, one to three iterations later
             wanted = int(rng.integers(1, 3))
             while wanted > 0:
                 line = process.stdout.readline()

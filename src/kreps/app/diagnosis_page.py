@@ -1,4 +1,4 @@
-"""The diagnosis of a run on one page: curves against thresholds, and the findings in words."""
+"""The diagnosis of a run on one page: curves with their thresholds, and the findings."""
 
 from __future__ import annotations
 
@@ -20,35 +20,49 @@ from matplotlib.ticker import (
     PercentFormatter,
 )
 
-from kreps.app import diagnosis
-from kreps.app.diagnosis import Finding, Row, Severity, column
+from kreps.app.diagnosis import Finding, Row, Severity, thresholds
+from kreps.app.diagnosis.columns import (
+    all_recorded,
+    column,
+    effective_share,
+    latest,
+    policy_targets,
+)
+from kreps.app.diagnosis.trend import reward_trend
 from kreps.errors import ConfigurationError
 from kreps.plotting import BLUE, GREY, STYLE
 
 COLOURS: dict[Severity, str] = {"limit": "#c0392b", "note": "#b07d10", "fine": "#2a8c7e"}
 PAGES = (".png", ".pdf", ".svg")
-WIDTH, HEIGHT, WORDS = 14.0, 8.8, 5.1
-"""Of the page and of its column of words, in inches."""
+WIDTH, HEIGHT, TEXT_WIDTH = 14.0, 8.8, 5.1
+"""Of the page, and of its column of text, in inches."""
+
+MAX_FONT_SIZE, MIN_FONT_SIZE = 9.5, 4.25
+"""Of the text in points; the largest size at which all findings fit is taken."""
 
 PANELS: dict[str, tuple[str, ...]] = {
-    "Average reward per step, and its trend": ("goal", "local optimum", "progress", "judgement"),
-    "KL divergence [nats]": ("step",),
-    "Temperature eta [s.d. of the reward]": ("step", "updates"),
-    "Effective samples, share of all": ("effective samples",),
+    "Average reward per step, and its trend": (
+        "goal",
+        "local optimum",
+        "progress",
+        "acceptance test",
+    ),
+    "KL divergence [nats]": ("KL bound",),
+    "Temperature eta [s.d. of the reward]": ("KL bound", "dual solver"),
+    "Effective sample size, share of all": ("effective sample size",),
     "Model: relative leave-one-out error": ("transition model",),
-    "Basis of V: features": ("basis of V",),
-    "Policy noise [half the action range]": ("exploration noise",),
-    "Commands beyond the limits": ("clipped actions",),
+    "Basis of V: number of features": ("basis of V",),
+    "Policy s.d. [half the action range]": ("exploration noise",),
+    "Actions beyond the limits, share": ("clipped actions",),
 }
-"""Headings in reading order, and the findings that each panel shows."""
+"""Headings in reading order, each with the findings whose severity the panel shows."""
 
 
 def check_page_name(path: Path) -> None:
-    """Raise `ConfigurationError` unless the name is that of a picture."""
+    """Raise `ConfigurationError` unless the name ends in one of `PAGES`."""
     if path.suffix not in PAGES:
-        raise ConfigurationError(
-            f"{path.name!r} is no page; end its name in {', '.join(PAGES[:-1])} or {PAGES[-1]}"
-        )
+        endings = f"{', '.join(PAGES[:-1])} or {PAGES[-1]}"
+        raise ConfigurationError(f"{path.name!r} is not the name of a page; end it in {endings}")
 
 
 def page(
@@ -58,7 +72,7 @@ def page(
 
     Args:
         rows: of ``progress.csv``.
-        findings: of them, the gravest first.
+        findings: about these rows, the most severe first.
         references: reference rewards of the task by name, from best to worst.
         title: of the page.
     """
@@ -67,7 +81,7 @@ def page(
         engine = figure.get_layout_engine()
         assert isinstance(engine, ConstrainedLayoutEngine)
         engine.set(w_pad=0.12, h_pad=0.07)
-        halves: Any = figure.subfigures(1, 2, width_ratios=(WIDTH - WORDS, WORDS))
+        halves: Any = figure.subfigures(1, 2, width_ratios=(WIDTH - TEXT_WIDTH, TEXT_WIDTH))
         left, right = halves
         plots = dict(zip(PANELS, left.subplots(4, 2, sharex=True).flat, strict=True))
         reward, kl, eta, effective, model, basis, noise, clipped = plots.values()
@@ -94,7 +108,7 @@ def page(
 
 
 def _mark(axes: Axes, severities: Sequence[Severity]) -> None:
-    """The gravest of some severities, above the panel on the right."""
+    """Write the most severe of some severities above the panel, on the right."""
     for severity in COLOURS:
         if severity in severities:
             axes.set_title(f"● {severity}", loc="right", color=COLOURS[severity], fontsize=9)
@@ -102,12 +116,12 @@ def _mark(axes: Axes, severities: Sequence[Severity]) -> None:
 
 
 def _curve(axes: Axes, rows: Sequence[Row], values: Any, **style: Any) -> None:
-    """Over the iterations; a word where there is nothing to draw."""
+    """Plot values (m,) over the iterations; a remark if all of them are NaN."""
     if np.isfinite(values).any():
         axes.plot(column(rows, "iteration"), values, "o-", color=BLUE, ms=3, lw=1.2, **style)
     else:
         axes.text(
-            0.5, 0.55, "none, or not recorded", transform=axes.transAxes, ha="center", color=GREY
+            0.5, 0.55, "none or not recorded", transform=axes.transAxes, ha="center", color=GREY
         )
 
 
@@ -120,7 +134,7 @@ def _line(
     below: bool = False,
     right: bool = False,
 ) -> None:
-    """A threshold or a reference, named above its left end, or below it, or at the right one."""
+    """A horizontal line with its name above or below its left or right end."""
     axes.axhline(value, color=colour, lw=0.9, ls="--", zorder=0)
     axes.annotate(
         text,
@@ -135,12 +149,13 @@ def _line(
     )
 
 
-def _bad(axes: Axes, low: float, high: float, severity: Severity) -> None:
+def _shade(axes: Axes, low: float, high: float, severity: Severity) -> None:
+    """Shade values in the colour of a severity."""
     axes.axhspan(low, high, color=COLOURS[severity], alpha=0.07, lw=0, zorder=-1)
 
 
 def _plain_decades(axes: Axes) -> None:
-    """Ticks of a logarithmic axis as plain numbers, few of them."""
+    """Few ticks on a logarithmic axis, as plain numbers."""
     low, high = axes.get_ylim()
     subs = (1.0, 3.0) if high < 1e3 * low else (1.0,)
     axes.yaxis.set_major_locator(LogLocator(subs=subs, numticks=8))
@@ -151,9 +166,9 @@ def _plain_decades(axes: Axes) -> None:
 def _draw_reward(axes: Axes, rows: Sequence[Row], references: Mapping[str, float]) -> None:
     values = column(rows, "average_reward")
     _curve(axes, rows, values, label="training")
-    for name, value in list(references.items())[:-1]:  # named where the curve is not
+    for name, value in list(references.items())[:-1]:  # named at the end where the curve is not
         _line(axes, value, f"{name}  {value:g}", right=value < values.mean())
-    found = diagnosis.improving(rows)
+    found = reward_trend(rows)
     if found is not None:
         time = column(rows, "iteration")[-found.iterations :]
         middle = values[-found.iterations :].mean()
@@ -167,14 +182,14 @@ def _draw_kl(axes: Axes, rows: Sequence[Row]) -> None:
     _curve(axes, rows, column(rows, "kl"))
     top = float(bound.max())
     _line(axes, float(bound[-1]), f"bound {bound[-1]:g}")
-    _line(axes, diagnosis.BOUND_UNUSED * float(bound[-1]), "half of it")
+    _line(axes, thresholds.LOW_KL_SHARE * float(bound[-1]), f"{thresholds.LOW_KL_SHARE:.0%} of it")
     axes.set_ylim(0.0, 1.25 * top)
 
 
 def _draw_eta(axes: Axes, rows: Sequence[Row]) -> None:
     _curve(axes, rows, column(rows, "eta"))
     axes.set_yscale("log")
-    floor = diagnosis.latest(rows, "eta_floor")
+    floor = latest(rows, "eta_floor")
     low, high = float(column(rows, "eta").min()), float(column(rows, "eta").max())
     if np.isfinite(floor):
         _line(axes, floor, f"floor {floor:.2g}", below=True)
@@ -184,13 +199,14 @@ def _draw_eta(axes: Axes, rows: Sequence[Row]) -> None:
 
 
 def _draw_effective_samples(axes: Axes, rows: Sequence[Row]) -> None:
-    _curve(axes, rows, diagnosis.effective_share(rows))
-    targets = float(diagnosis.targets(rows)[-1])
-    least = max(diagnosis.LEAST_SHARE, diagnosis.LEAST_EFFECTIVE / targets)
-    severity: Severity = "note" if least == diagnosis.LEAST_SHARE else "limit"
-    text = f"{diagnosis.LEAST_SHARE:.0%}" if severity == "note" else "30 samples"
-    _line(axes, least, text, COLOURS[severity])
-    _bad(axes, 0.0, least, severity)
+    _curve(axes, rows, effective_share(rows))
+    share = thresholds.MIN_EFFECTIVE_SHARE
+    count_as_share = thresholds.MIN_EFFECTIVE_SAMPLES / float(policy_targets(rows)[-1])
+    severity: Severity = "note" if share >= count_as_share else "limit"
+    minimum = max(share, count_as_share)
+    text = f"{share:.0%}" if severity == "note" else f"{thresholds.MIN_EFFECTIVE_SAMPLES:g} samples"
+    _line(axes, minimum, text, COLOURS[severity])
+    _shade(axes, 0.0, minimum, severity)
     axes.set_ylim(0.0, 1.0)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
 
@@ -198,29 +214,30 @@ def _draw_effective_samples(axes: Axes, rows: Sequence[Row]) -> None:
 def _draw_model(axes: Axes, rows: Sequence[Row]) -> None:
     values = column(rows, "model_error")
     _curve(axes, rows, values)
-    _line(axes, diagnosis.ERROR_NOTE, f"note {diagnosis.ERROR_NOTE:g}", COLOURS["note"], below=True)
-    _line(axes, diagnosis.ERROR_LIMIT, f"limit {diagnosis.ERROR_LIMIT:g}", COLOURS["limit"])
+    note, limit = thresholds.MODEL_ERROR_NOTE, thresholds.MODEL_ERROR_LIMIT
+    _line(axes, note, f"note {note:g}", COLOURS["note"], below=True)
+    _line(axes, limit, f"limit {limit:g}", COLOURS["limit"])
     top = max(1.1, 1.1 * float(np.nanmax(values, initial=0.0)))
-    _bad(axes, diagnosis.ERROR_NOTE, diagnosis.ERROR_LIMIT, "note")
-    _bad(axes, diagnosis.ERROR_LIMIT, top, "limit")
+    _shade(axes, note, limit, "note")
+    _shade(axes, limit, top, "limit")
     axes.set_ylim(0.0, top)
 
 
 def _draw_basis(axes: Axes, rows: Sequence[Row]) -> None:
     rank = column(rows, "rank")
     _curve(axes, rows, rank)
-    cap = diagnosis.latest(rows, "max_rank")
+    max_rank = latest(rows, "max_rank")
     top = float(rank.max())
-    if np.isfinite(cap):
-        _line(axes, cap, f"cap {cap:.0f}")
-        top = max(top, cap)
+    if np.isfinite(max_rank):
+        _line(axes, max_rank, f"largest {max_rank:.0f}")
+        top = max(top, max_rank)
     axes.set_ylim(0.0, 1.25 * top)
-    residual = diagnosis.latest(rows, "rank_residual")
-    fixed = diagnosis.recorded(rows) and not np.isfinite(cap)
+    residual = latest(rows, "rank_residual")
+    fixed = all_recorded(rows) and not np.isfinite(max_rank)
     axes.text(
         0.99,
         0.06,
-        "left out: not measured" if fixed else f"left out: {residual:.1g}",
+        "residual not measured" if fixed else f"squared residual {residual:.1g}",
         transform=axes.transAxes,
         ha="right",
         color=GREY,
@@ -231,14 +248,14 @@ def _draw_basis(axes: Axes, rows: Sequence[Row]) -> None:
 def _draw_noise(axes: Axes, rows: Sequence[Row]) -> None:
     values = column(rows, "policy_noise")
     _curve(axes, rows, values)
-    least, most = diagnosis.NOISE_LEAST, diagnosis.NOISE_MOST
-    _line(axes, least, f"too still {least:g}", COLOURS["limit"])
-    _line(axes, most, f"wild {most:g}", COLOURS["note"])
+    low_std, high_std = thresholds.MIN_POLICY_STD, thresholds.MAX_POLICY_STD
+    _line(axes, low_std, f"limit {low_std:g}", COLOURS["limit"])
+    _line(axes, high_std, f"note {high_std:g}", COLOURS["note"])
     known = values[np.isfinite(values)]
-    low = 0.5 * min([least, *known])
-    high = 2.5 * max([most, *known])
-    _bad(axes, low, least, "limit")
-    _bad(axes, most, high, "note")
+    low = 0.5 * min([low_std, *known])
+    high = 2.5 * max([high_std, *known])
+    _shade(axes, low, low_std, "limit")
+    _shade(axes, high_std, high, "note")
     axes.set_yscale("log")
     axes.set_ylim(low, high)
     _plain_decades(axes)
@@ -246,21 +263,20 @@ def _draw_noise(axes: Axes, rows: Sequence[Row]) -> None:
 
 def _draw_clipping(axes: Axes, rows: Sequence[Row]) -> None:
     _curve(axes, rows, column(rows, "clipped"))
-    _line(
-        axes, diagnosis.CLIPPED_NOTE, f"{diagnosis.CLIPPED_NOTE:.0%}", COLOURS["note"], below=True
-    )
-    _bad(axes, diagnosis.CLIPPED_NOTE, 1.04, "note")
+    note = thresholds.CLIPPED_NOTE
+    _line(axes, note, f"note {note:.0%}", COLOURS["note"], below=True)
+    _shade(axes, note, 1.04, "note")
     axes.set_ylim(0.0, 1.04)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
 
 
-# ---- words ------------------------------------------------------------------------------------
+# ---- text -------------------------------------------------------------------------------------
 
 
 def _write(side: SubFigure, findings: Sequence[Finding]) -> None:
-    """All findings below each other, in the largest letters for which they fit."""
+    """All findings below each other, in the largest font size at which they fit."""
     room = 72.0 * (HEIGHT - 0.75)
-    for size in np.arange(9.5, 4.0, -0.25):
+    for size in np.arange(MAX_FONT_SIZE, MIN_FONT_SIZE - 0.25, -0.25):
         lines = _lines(findings, size)
         if sum(skip for _, _, skip in lines) <= room:
             break
@@ -271,23 +287,22 @@ def _write(side: SubFigure, findings: Sequence[Finding]) -> None:
 
 
 def _lines(findings: Sequence[Finding], size: float) -> list[tuple[str, dict[str, Any], float]]:
-    """Lines of text, their styles and how far each lies below the one before, in points."""
-    letters = int(72.0 * (WORDS - 0.4) / (0.535 * size))
+    """Lines of text, their styles, and the distance of each from the one above in points."""
+    width = int(72.0 * (TEXT_WIDTH - 0.4) / (0.535 * size))
     lines: list[tuple[str, dict[str, Any], float]] = []
     for finding in findings:
         heading = f"{finding.severity.upper()}   {finding.name}"
         bold = {"fontweight": "bold", "color": COLOURS[finding.severity]}
         lines.append((heading, bold, 2.1 * size))
-        lines += [
-            (t, {"color": "#222222"}, 1.3 * size) for t in _wrapped(finding.sentence, letters)
-        ]
+        sentence = _wrapped(finding.sentence, width)
+        lines += [(text, {"color": "#222222"}, 1.3 * size) for text in sentence]
         if finding.remedy:
-            remedy = _wrapped(f"Try: {finding.remedy}", letters)
-            lines += [(t, {"color": BLUE}, 1.3 * size) for t in remedy]
+            remedy = _wrapped(f"Try: {finding.remedy}", width)
+            lines += [(text, {"color": BLUE}, 1.3 * size) for text in remedy]
     return lines
 
 
-def _wrapped(text: str, letters: int) -> list[str]:
-    """Lines of at most so many letters; an option stays in one line."""
+def _wrapped(text: str, width: int) -> list[str]:
+    """Lines of at most ``width`` letters; an option and its value stay on one line."""
     text = text.replace("--set ", "--set\N{NO-BREAK SPACE}")
-    return textwrap.wrap(text, letters, break_on_hyphens=False)
+    return textwrap.wrap(text, width, break_on_hyphens=False)

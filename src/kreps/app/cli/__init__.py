@@ -1,0 +1,83 @@
+"""The command line: train, resume, settings, evaluate, plot, diagnose, video, export and so on.
+
+Each module has the commands of one purpose; this one assembles them.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from inspect import getdoc
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.text import Text
+
+import kreps
+from kreps.app.cli.export import EXPORT_EXAMPLES, export
+from kreps.app.cli.inspect import (
+    DIAGNOSE_EXAMPLES,
+    EVALUATE_EXAMPLES,
+    PLOT_EXAMPLES,
+    VIDEO_EXAMPLES,
+    diagnose,
+    evaluate,
+    plot,
+    video,
+)
+from kreps.app.cli.reproduce import REPRODUCE_EXAMPLES, SEARCH_EXAMPLES, reproduce, search
+from kreps.app.cli.settings import SETTINGS_EXAMPLES, settings, settings_help
+from kreps.app.cli.train import RESUME_EXAMPLES, TRAIN_EXAMPLES, resume, train
+from kreps.app.console import say
+from kreps.errors import KrepsError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    help="Kernel-based, non-parametric policy search: REPS with RKHS embeddings.\n\n"
+    "[bold]Start here:[/bold]  kreps train kreps/SwingUp-v0 --out runs/swing-up",
+)
+
+
+@app.callback(invoke_without_command=True)
+def options(
+    version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False,
+) -> None:
+    if version:
+        say(f"kreps {kreps.__version__}")
+        raise typer.Exit
+
+
+def _add(command: Callable[..., Any], examples: Sequence[str], more_help: str = "") -> None:
+    lines = "\n\n".join(f"  {example}" for example in examples)
+    text = f"{getdoc(command)}\n\n{more_help}"
+    app.command(help=text, epilog=f"Examples:\n\n{lines}")(command)
+
+
+_add(train, TRAIN_EXAMPLES, settings_help())
+_add(resume, RESUME_EXAMPLES)
+_add(settings, SETTINGS_EXAMPLES)
+_add(evaluate, EVALUATE_EXAMPLES)
+_add(plot, PLOT_EXAMPLES)
+_add(diagnose, DIAGNOSE_EXAMPLES)
+_add(video, VIDEO_EXAMPLES)
+_add(export, EXPORT_EXAMPLES)
+_add(reproduce, REPRODUCE_EXAMPLES)
+_add(search, SEARCH_EXAMPLES)
+
+
+def main() -> None:
+    """Run the command line; an error of the library is printed as one line, not as a traceback."""
+    try:
+        sys.exit(app(standalone_mode=False))  # a command's typer.Exit is returned as its code
+    except KrepsError as error:
+        message = Text.assemble(("error: ", "bold red"), str(error))
+        Console(stderr=True).print(message, soft_wrap=True)
+        sys.exit(2)
+    except Exception as error:
+        if hasattr(error, "show"):  # a usage error of the command line
+            error.show()
+            sys.exit(2)
+        raise

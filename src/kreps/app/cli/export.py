@@ -1,0 +1,118 @@
+"""The command that writes a policy for use elsewhere: export."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from kreps.app.console import say
+from kreps.app.run_folder import RunFolder
+from kreps.errors import ConfigurationError
+from kreps.learning.policy import Policy, load_policy, mean_difference
+
+EXPORT_EXAMPLES = (
+    "kreps export runs/swing-up --out policy.onnx",
+    "kreps export runs/swing-up --centres 50 --dtype float32 --out policy.onnx",
+    "kreps export runs/swing-up/policy.safetensors --centres 50 --out small.safetensors",
+)
+
+SUFFIXES = (".onnx", ".safetensors")
+"""File names that `export` writes."""
+
+MAX_COMPRESSION_ERROR = 0.02
+"""Root-mean-square error of a compressed policy, in units of the action scale, above which there
+is a warning.  Compressed policies of the swing-up with a smaller error lost less than half a reward
+per step (benchmarks/predict.py)."""
+
+
+def export(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            metavar="RUN_OR_POLICY",
+            help="Folder of the run, or a policy's .safetensors file.",
+            show_default=False,
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option(help="An .onnx file, or a .safetensors file for kreps.load_policy.")
+    ],
+    centres: Annotated[
+        int | None,
+        typer.Option(min=1, help="Compress to at most so many support points; all if not given."),
+    ] = None,
+    dtype: Annotated[
+        str, typer.Option(help="float64 or float32, of an ONNX model's input and outputs.")
+    ] = "float64",
+) -> None:
+    """Write the policy for a controller: as an ONNX model, or compressed.
+
+    A model needs no Python on the robot.  Its input is [bold]observation[/bold] (batch, ds).  Its
+    outputs are [bold]action[/bold] (batch, da), without exploration and within the limits, and
+    [bold]standard_deviation[/bold] (batch, da).  It needs: pip install 'kreps\\[onnx]'.
+    """
+    if out.suffix not in SUFFIXES:
+        raise ConfigurationError(
+            f"--out {out} is not the name of a policy; end it in {' or '.join(SUFFIXES)}"
+        )
+    file = _policy_file(source)
+    policy = load_policy(file)
+    if centres is not None:
+        policy = _compressed(policy, centres)
+    if out.suffix == ".onnx":
+        kind = _write_model(policy, out, dtype)
+    else:
+        kind = _write_policy(policy, out, dtype, file)
+    say(f"wrote {out}: {kind}, {out.stat().st_size / 1e3:.0f} kB")
+
+
+def _policy_file(source: Path) -> Path:
+    """The policy of a run folder; any other path is that of a policy."""
+    if not source.is_dir():
+        return source
+    folder = RunFolder(source)
+    folder.config()  # an error if this is not a run folder
+    if not folder.policy_file.exists():
+        raise ConfigurationError(
+            f"{source} has no policy yet; make the first update with `kreps resume {source}`"
+        )
+    return folder.policy_file
+
+
+def _compressed(policy: Policy, centres: int) -> Policy:
+    """The policy with fewer support points; its error is printed."""
+    compressed = policy.compressed(centres)
+    if compressed is not policy:
+        error = mean_difference(policy, compressed)
+        say(f"compressed: at its samples the action changes by {error:.2g} of its scale (rms)")
+        if error > MAX_COMPRESSION_ERROR:
+            say(
+                f"this is more than {MAX_COMPRESSION_ERROR:g}: take more centres, or evaluate the "
+                "policy before its use"
+            )
+    return compressed
+
+
+def _write_model(policy: Policy, out: Path, dtype: str) -> str:
+    arithmetic = policy.export_onnx(out, dtype)
+    kind = f"a model with {arithmetic} arithmetic"
+    if dtype == "float32" != arithmetic:
+        kind += " (with so many centres float32 is not accurate enough; try --centres 50)"
+    return kind
+
+
+def _write_policy(policy: Policy, out: Path, dtype: str, source: Path) -> str:
+    if dtype != "float64":
+        raise ConfigurationError(
+            f"--dtype {dtype}, but .safetensors files of kreps hold float64 only; leave it "
+            "out, or write an .onnx file"
+        )
+    if out.resolve() == source.resolve():
+        raise ConfigurationError(
+            f"--out {out} is the file that is read; it would overwrite the exact policy, so choose "
+            "another name"
+        )
+    policy.save(out)
+    return "a policy for kreps.load_policy"

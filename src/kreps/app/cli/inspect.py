@@ -1,0 +1,85 @@
+"""The commands that look at a run: evaluate, plot, diagnose and video."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from kreps.app.cli.runs import RunArgument, learnt
+from kreps.app.console import say
+from kreps.app.evaluation import evaluate_run
+from kreps.app.pictures import draw_diagnosis, draw_run, film_run
+from kreps.app.report import say_diagnosis
+from kreps.app.run_folder import RunFolder
+from kreps.learning.evaluate import EPISODES, STEPS
+
+EVALUATE_EXAMPLES = ("kreps evaluate runs/swing-up --episodes 200 --steps 400",)
+PLOT_EXAMPLES = ("kreps plot runs/swing-up",)
+DIAGNOSE_EXAMPLES = (
+    "kreps diagnose runs/swing-up",
+    "kreps diagnose runs/swing-up --out swing-up.pdf",
+)
+VIDEO_EXAMPLES = (
+    "kreps video runs/swing-up",
+    "kreps video runs/swing-up --steps 200 --stochastic --out swing-up.gif",
+)
+
+
+def evaluate(
+    run: RunArgument,
+    episodes: Annotated[int, typer.Option(min=2, help="Rollouts per policy.")] = EPISODES,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of each, without restarts.")] = STEPS,
+    seed: Annotated[int, typer.Option(min=0, help="Of the evaluation.")] = 0,
+) -> None:
+    """Measure the average reward per step of the policy, with and without exploration noise."""
+    folder = RunFolder(run)
+    evaluate_run(folder, learnt(folder), episodes, steps, seed)
+
+
+def plot(run: RunArgument) -> None:
+    """Draw the learning curve and, for two-dimensional states, maps of the policy and of V."""
+    folder = RunFolder(run)
+    for path in draw_run(folder, learnt(folder)):
+        say(f"drew {path}")
+
+
+def diagnose(
+    run: RunArgument,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="A .png, .pdf or .svg file; diagnosis.png in the run if not given."),
+    ] = None,
+) -> None:
+    """Explain what limits a run and what to try, and draw it on one page.
+
+    The findings are about the dual solver, the step, the effective sample size, the acceptance
+    test, the transition model, the basis of V, the exploration and the reward, each compared with
+    a threshold.  [bold]limit[/bold]: it limits the run; [bold]note[/bold]: it may or may not;
+    [bold]fine[/bold]: it does not.  Only the files of the run are read, so no environment is
+    needed.  After an evaluation the cost of the exploration noise is included.
+    """
+    from kreps.app.diagnosis_page import check_page_name  # imports Matplotlib
+
+    folder = RunFolder(run)
+    folder.config()  # an error if this is not a run folder
+    out = out or folder.path / "diagnosis.png"
+    check_page_name(out)
+    findings = say_diagnosis(folder)
+    say(f"drew {draw_diagnosis(folder, findings, out)}")
+
+
+def video(
+    run: RunArgument,
+    steps: Annotated[int, typer.Option(min=1, help="Largest length of the rollout.")] = 120,
+    stochastic: Annotated[bool, typer.Option(help="With exploration noise.")] = False,
+    seed: Annotated[int, typer.Option(min=0, help="Of the rollout.")] = 0,
+    out: Annotated[
+        Path | None, typer.Option(help="A .gif file; video.gif in the run if not given.")
+    ] = None,
+) -> None:
+    """Film the policy in its environment."""
+    folder = RunFolder(run)
+    path = film_run(folder, learnt(folder), steps, stochastic=stochastic, seed=seed, out=out)
+    say(f"filmed {path}")

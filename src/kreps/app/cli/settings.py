@@ -1,0 +1,105 @@
+"""Settings on the command line: their syntax, their help, and the command that lists them."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass
+from typing import Annotated, Any
+
+import typer
+from rich.table import Table
+
+from kreps.app.console import console
+from kreps.errors import ConfigurationError
+from kreps.presets import PRESETS, SECTIONS, flat, settings_of
+from kreps.settings import LearnerSettings, Settings
+
+SETTINGS_EXAMPLES = ("kreps settings", "kreps settings --preset paper")
+
+
+def parse_setting(text: str) -> tuple[str, Any]:
+    """Name and value of ``NAME=VALUE``.
+
+    The value is read as JSON if it is valid JSON, ``none`` as None, and all else as a string.
+
+    Raises:
+        ConfigurationError: there is no equals sign.
+    """
+    name, equals, value = text.partition("=")
+    if not equals:
+        raise ConfigurationError(f"--set {text!r} is not NAME=VALUE, such as kl_bound=0.5")
+    if value.lower() == "none":
+        return name, None
+    try:
+        return name, json.loads(value)
+    except ValueError:
+        return name, value
+
+
+def settings_help() -> str:
+    """The names of all settings by section, for ``kreps train --help``."""
+    plain = [each.name for each in fields(Settings) if each.name not in SECTIONS]
+    lines = [f"  {', '.join(plain)}"]
+    for section, kinds in SECTIONS.items():
+        types = {type(default): kind for kind, default in kinds.items()}
+        for section_type, kind in types.items():
+            names = ", ".join(f"{section}.{each.name}" for each in fields(section_type))
+            lines.append(f"  {names}" + (f" (with {section}={kind})" if len(types) > 1 else ""))
+    absent = " and ".join(f"{name}=none" for name in optional_sections())
+    return "\n\n".join(
+        [
+            "[bold]Settings[/bold] for --set NAME=VALUE, explained by [bold]kreps settings[/bold]:",
+            *lines,
+            f"{absent} leave a section out.",
+        ]
+    )
+
+
+def optional_sections() -> list[str]:
+    """Sections that may be None."""
+    return [each.name for each in fields(Settings) if each.name in SECTIONS and "None" in each.type]
+
+
+def descriptions(settings_type: type[Any]) -> dict[str, str]:
+    """The text about each field, from the docstrings of a class and of its bases."""
+    found: dict[str, str] = {}
+    for each in reversed(settings_type.__mro__):
+        found |= dict(_attributes(inspect.getdoc(each) or ""))
+    return found
+
+
+def _attributes(docstring: str) -> Iterator[tuple[str, str]]:
+    """Names and texts of the section "Attributes" of a docstring."""
+    _, _, attributes = docstring.partition("Attributes:\n")
+    for name, text in re.findall(r"^    (\w+): ((?:.+\n?)(?:     +.+\n?)*)", attributes, re.M):
+        yield name, " ".join(text.replace("``", "").split())
+
+
+def settings(
+    preset: Annotated[str, typer.Option(help=f"One of: {', '.join(PRESETS)}.")] = next(
+        iter(PRESETS)
+    ),
+) -> None:
+    """List all settings with their values in a preset and their meaning."""
+    chosen = settings_of(preset)
+    values = flat(chosen)
+    table = Table(title=f"Settings of the preset {preset}, for --set NAME=VALUE")
+    for heading in ("name", "value", "meaning"):
+        table.add_column(heading, overflow="fold")
+    for name, text in _all_descriptions(chosen):
+        value = values.get(name, "")
+        table.add_row(name, "none" if value is None else str(value), text)
+    console.print(table, markup=False)
+
+
+def _all_descriptions(chosen: LearnerSettings) -> Iterator[tuple[str, str]]:
+    """Flat names and texts, each section followed by its fields."""
+    for name, text in descriptions(type(chosen)).items():
+        yield name, text
+        section = getattr(chosen, name, None)
+        if is_dataclass(section):
+            for part, meaning in descriptions(type(section)).items():
+                yield f"{name}.{part}", meaning

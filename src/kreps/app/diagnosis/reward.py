@@ -1,0 +1,154 @@
+"""Findings about the reward: whether it contains a goal, a local optimum, or a trend."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from kreps.app.diagnosis.columns import Row, column, kl_share, recent, reward_range
+from kreps.app.diagnosis.finding import Finding, counted
+from kreps.app.diagnosis.remedies import MORE_DATA, higher_floor
+from kreps.app.diagnosis.thresholds import (
+    LOW_KL_SHARE,
+    MAX_LEVEL_RISE,
+    MIN_ITERATIONS,
+    MIN_REWARD_RISE,
+    REFERENCE_TOLERANCE,
+)
+from kreps.app.diagnosis.trend import Trend, reward_rises, reward_trend
+
+Evaluation = Mapping[str, Any]
+"""Of ``evaluation.json``."""
+
+
+def goal(rows: Sequence[Row]) -> Finding | None:
+    """Whether no reward depends on the state; None if one does, or if that was not recorded."""
+    exploring = column(rows, "exploring")
+    if not exploring[-1] > 0.0:
+        return None
+    return Finding(
+        "goal",
+        "limit",
+        float(np.sum(exploring > 0.0)),
+        0.0,
+        "No rollout in the window has a state-dependent reward, so the goal was not reached; "
+        "exploring until one does.",
+        f"more rollouts (kreps resume RUN --iterations {2 * len(rows)}), or a new run with longer "
+        "ones (--set restart_probability=0.01); in Python, update(rollouts) with rollouts that "
+        "reach the goal.",
+    )
+
+
+def best_estimate(rows: Sequence[Row], evaluation: Evaluation | None) -> float:
+    """Reward per step of the greedy policy if evaluated, else of the latest training rollouts."""
+    return evaluation["greedy"]["mean"] if evaluation else recent(rows, "average_reward")
+
+
+def nearest_reference(references: Mapping[str, float], reward: float) -> tuple[str, float] | None:
+    """The reference near a reward, best and worst excepted: a known local optimum."""
+    values = list(references.values())
+    for name, value in list(references.items())[1:-1]:
+        if abs(reward - value) < REFERENCE_TOLERANCE * abs(values[0] - values[-1]):
+            return name, value
+    return None
+
+
+def local_optimum(
+    rows: Sequence[Row], evaluation: Evaluation | None, references: Mapping[str, float]
+) -> Finding | None:
+    """Whether the reward is near a known local optimum and does not rise."""
+    reward = best_estimate(rows, evaluation)
+    near = nearest_reference(references, reward)
+    if near is None or reward_rises(rows):
+        return None
+    name, value = near
+    return Finding(
+        "local optimum",
+        "limit",
+        reward,
+        value,
+        f"The reward, {reward:.4g}, does not rise and is near a reference below "
+        f"the best one: {name} ({value:g}).",
+        "a new run with another --seed, more initial rollouts (--set initial_rollouts=60) or "
+        "smaller steps (--set kl_bound=0.5). More iterations seldom help.",
+    )
+
+
+def progress(
+    rows: Sequence[Row], evaluation: Evaluation | None, references: Mapping[str, float]
+) -> Finding:
+    """Whether the training reward rises, falls or is level."""
+    name = "progress"
+    found = reward_trend(rows)
+    if found is None:
+        return Finding(
+            name,
+            "note",
+            len(rows),
+            MIN_ITERATIONS,
+            f"The trend of the reward is unknown after {counted(len(rows), 'iteration')}; "
+            f"{MIN_ITERATIONS} are needed.",
+            "more iterations: kreps resume RUN --iterations 20",
+        )
+    minimum = MIN_REWARD_RISE * reward_range(rows)
+    limit = max(found.error, minimum)
+    measured = f"{found.rise:+.3g} ± {found.error:.2g} over the last {found.iterations} iterations"
+    if found.falls(minimum):
+        return Finding(
+            name,
+            "limit",
+            found.rise,
+            -limit,
+            f"The reward falls: {measured}.",
+            "smaller steps (--set kl_bound=0.3) with more rollouts for each (--set "
+            "rollouts_per_iteration=20). Only the latest policy is stored; the same run with "
+            "fewer iterations reproduces an earlier one.",
+        )
+    if found.rises(minimum):
+        return Finding(name, "fine", found.rise, limit, f"The reward rises: {measured}.")
+    reward, values = best_estimate(rows, evaluation), list(references.values())
+    if values and values[0] - reward < REFERENCE_TOLERANCE * (values[0] - values[-1]):
+        return Finding(
+            name,
+            "fine",
+            found.rise,
+            limit,
+            f"The reward does not rise ({measured}) and is near the best reference value "
+            f"({values[0]:g}).",
+        )
+    return _level(rows, name, found, limit, measured)
+
+
+def _level(rows: Sequence[Row], name: str, found: Trend, limit: float, measured: str) -> Finding:
+    """The finding where the reward neither rises nor falls and is not near the best reference."""
+    if not found.below(MAX_LEVEL_RISE * reward_range(rows)):
+        return Finding(
+            name,
+            "note",
+            found.rise,
+            limit,
+            f"The reward varies too much for a trend: {measured}.",
+            f"more iterations (kreps resume RUN --iterations {2 * len(rows)}), or more rollouts "
+            "for each (--set rollouts_per_iteration=20).",
+        )
+    share = kl_share(rows[-found.iterations :])
+    if share > LOW_KL_SHARE:
+        return Finding(
+            name,
+            "limit",
+            found.rise,
+            limit,
+            f"The reward does not rise ({measured}), although the updates use {share:.0%} of the "
+            "KL bound: the gains that they predict are errors of the model, or noise.",
+            f"more data ({MORE_DATA}), or smaller steps (--set kl_bound=0.5 {higher_floor(rows)}).",
+        )
+    return Finding(
+        name,
+        "fine",
+        found.rise,
+        limit,
+        f"The reward does not rise ({measured}), and the updates use {share:.0%} of the KL bound: "
+        "the run has converged.",
+    )

@@ -1,0 +1,108 @@
+"""Pictures of a run folder: learning curve, policy maps, film and the page of the diagnosis.
+
+Matplotlib is imported only where a picture is drawn, so that other commands start quickly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from kreps.app.console import console
+from kreps.app.diagnosis import Finding
+from kreps.app.environments import labels_of, make_environment, references_of
+from kreps.app.run_folder import RunFolder
+from kreps.errors import EnvironmentFailure
+from kreps.learning.methods import KREPS
+from kreps.learning.policy import Policy
+
+
+def draw_run(folder: RunFolder, learner: KREPS) -> list[Path]:
+    """Draw the learning curve and, for two-dimensional states, the maps of the policy and of V.
+
+    Raises:
+        ConfigurationError: the run has no iteration yet.
+    """
+    from kreps import plotting
+    from kreps.app.plots.learning_curve import learning_curve
+    from kreps.app.plots.policy_maps import policy_maps
+
+    assert learner.env is not None
+    rows, config = folder.recorded_rows(), folder.config()
+    evaluation = folder.evaluation(learner.state.iteration)
+    with console.status("drawing ..."):
+        curve = learning_curve(rows, references_of(config), evaluation, config.environment)
+        drawn = [plotting.save(curve, folder.path / "learning_curve.png")]
+        if learner.task.observation_size == 2:
+            labels = labels_of(learner.env, learner.task)
+            maps = policy_maps(learner.state, learner.task, labels)
+            drawn.append(plotting.save(maps, folder.path / "policy_maps.png"))
+    return drawn
+
+
+def film_run(
+    folder: RunFolder,
+    learner: KREPS,
+    steps: int = 120,
+    *,
+    stochastic: bool = False,
+    seed: int = 0,
+    out: Path | None = None,
+) -> Path:
+    """Film a rollout of the learnt policy in a new environment.
+
+    Args:
+        folder: of the run.
+        learner: with at least one update.
+        steps: largest length of the rollout.
+        stochastic: whether the policy acts with its exploration noise.
+        seed: of the rollout.
+        out: a ``.gif`` file; ``video.gif`` in the run if None.
+
+    Raises:
+        ConfigurationError: ``out`` does not end in ``.gif``, or the environment cannot be made.
+        EnvironmentFailure: the environment raised, for example because it cannot be drawn.
+    """
+    from kreps.app.plots.film import Recording, check_film_name, film
+
+    path = out or folder.path / "video.gif"
+    check_film_name(path)
+    env = make_environment(folder.config().environment, render_mode="rgb_array")
+    policy = Policy(learner.policy.process, seed)
+    frames, observations, actions = [], [], []
+    with console.status("filming ..."):
+        try:
+            observation, _ = env.reset(seed=seed)
+            for _ in range(steps):
+                action, _ = policy.predict(observation.ravel(), deterministic=not stochastic)
+                frames.append(env.render())
+                observations.append(observation.ravel())
+                actions.append(action)
+                space = env.action_space
+                observation, _, terminated, truncated, _ = env.step(
+                    action.astype(space.dtype).reshape(space.shape or ())
+                )
+                if terminated or truncated:
+                    break
+        except Exception as error:  # whatever a foreign environment raises
+            raise EnvironmentFailure(
+                f"the environment cannot be filmed, it raised {type(error).__name__}: {error}"
+            ) from error
+        finally:
+            env.close()
+        fps = float(env.metadata.get("render_fps", 20))
+        recording = Recording(frames, np.array(observations), np.array(actions), fps)
+        return film(recording, learner.state, learner.task, labels_of(env, learner.task), path)
+
+
+def draw_diagnosis(folder: RunFolder, findings: Sequence[Finding], path: Path) -> Path:
+    """Draw the page of the diagnosis."""
+    from kreps import plotting
+    from kreps.app import diagnosis_page
+
+    config = folder.config()
+    title = f"{config.environment}, {folder.path}"
+    page = diagnosis_page.page(folder.recorded_rows(), findings, references_of(config), title)
+    return plotting.save(page, path)

@@ -1,0 +1,179 @@
+"""``progress.csv``: one row of numbers per iteration of a run.
+
+eta, its floor, dual, primal and gap are in standard deviations of the reward.  ``weighted`` is the
+number of samples with a weight in the last step of an update, generated ones included.
+``policy_noise`` is the policy's standard deviation near its data, in units of half the action
+range.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from kreps.algorithms.dual import Outcome
+from kreps.errors import StorageError
+from kreps.learning.learner import IterationReport
+from kreps.learning.methods import KREPS
+from kreps.learning.progress import seconds_by_stage
+from kreps.legacy import present_columns
+from kreps.settings import RKHS, Settings
+
+STAGES = (
+    "rollouts",
+    "basis",
+    "embedding fit",
+    "embedding",
+    "dual",
+    "policy fit",
+    "policy",
+    "generated samples",
+    "acceptance test",
+)
+"""Stages of an iteration whose CPU seconds are recorded."""
+
+ADDED_COLUMNS = (
+    "cpu_seconds_generated_samples",
+    "weighted",
+    "model_error",
+    "clipped",
+    "eta_floor",
+    "policy_noise",
+    "max_rank",
+    "ridge",
+    "exploring",
+    "rejected",
+    "cpu_seconds_acceptance_test",
+)
+"""Columns that runs of earlier versions lack, in the order in which they were added.
+
+A missing one is read as NaN.  Present ones may be NaN: ``model_error`` without a model,
+``max_rank`` with a fixed number of features of V, ``rejected`` without an acceptance test.
+"""
+
+
+def seconds_column(stage: str) -> str:
+    """Column of the CPU seconds of a stage."""
+    return f"cpu_seconds_{stage.replace(' ', '_')}"
+
+
+COLUMNS = (
+    "iteration",
+    "rollouts",
+    "steps",
+    "average_reward",
+    "kl",
+    "kl_bound",
+    "eta",
+    "effective_samples",
+    "samples",
+    "rank",
+    "rank_residual",
+    "support",
+    "dual",
+    "primal",
+    "gap",
+    "decrement",
+    "stationarity",
+    "newton_iterations",
+    "outcome",
+    "jitter",
+    *(column for column in map(seconds_column, STAGES) if column not in ADDED_COLUMNS),
+    *ADDED_COLUMNS,
+)
+
+
+def read_progress(path: Path) -> list[dict[str, str]]:
+    """The rows by column; empty if there is no such file.
+
+    Columns of earlier versions have their present names, and "nan" where they are missing.
+
+    Raises:
+        StorageError: it is not what a run writes.
+    """
+    try:
+        with open(path, newline="") as file:
+            reader = csv.reader(file)
+            columns = present_columns(next(reader, []))
+            _check_columns(columns)
+            return [_checked_row(columns, values) for values in reader if values]
+    except FileNotFoundError:
+        return []
+    except (OSError, ValueError, TypeError, csv.Error) as error:
+        raise StorageError(
+            f"{path} is damaged ({error}); remove it to continue without the earlier rows, the "
+            "checkpoint has everything that the learner needs"
+        ) from error
+
+
+def _check_columns(columns: Sequence[str]) -> None:
+    first = len(COLUMNS) - len(ADDED_COLUMNS)
+    if len(columns) < first or tuple(columns) != COLUMNS[: len(columns)]:
+        raise ValueError("its columns are not those of a run")
+
+
+def _checked_row(columns: Sequence[str], values: Sequence[str]) -> dict[str, str]:
+    row = dict.fromkeys(COLUMNS, "nan") | dict(zip(columns, values, strict=True))
+    if row["outcome"] not in Outcome.__members__:
+        raise ValueError(f"it has an unknown outcome {row['outcome']!r:.40}")
+    for name in COLUMNS:
+        value = 0.0 if name == "outcome" else float(row[name])
+        if not (math.isfinite(value) or (name in ADDED_COLUMNS and math.isnan(value))):
+            raise ValueError("it holds NaN or infinities")
+    return row
+
+
+def progress_text(rows: Sequence[Mapping[str, Any]]) -> str:
+    """The rows as the content of a file."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, COLUMNS, lineterminator="\n", extrasaction="ignore")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def max_rank(settings: Settings) -> float:
+    """Largest number of features of V; NaN where their number is fixed, as on a grid."""
+    return settings.value.max_rank if isinstance(settings.value, RKHS) else math.nan
+
+
+def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
+    """The row of an iteration."""
+    info, dual = report.update, report.update.dual
+    seconds = seconds_by_stage(report)
+    return {
+        "iteration": report.iteration,
+        "rollouts": report.rollouts,
+        "steps": report.steps,
+        "average_reward": report.average_reward,
+        "kl": dual.kl,
+        "kl_bound": learner.settings.kl_bound,
+        "eta": dual.eta,
+        "effective_samples": info.effective_samples,
+        "samples": info.samples,
+        "rank": info.rank,
+        "rank_residual": info.rank_residual,
+        "support": info.support,
+        "dual": dual.dual,
+        "primal": dual.primal,
+        "gap": dual.gap,
+        "decrement": dual.decrement,
+        "stationarity": dual.stationarity,
+        "newton_iterations": dual.iterations,
+        "outcome": dual.outcome.name,
+        "jitter": info.jitter,
+        "weighted": len(dual.weights),
+        "model_error": info.model_error,
+        "clipped": info.clipped,
+        "eta_floor": info.eta_floor,
+        "policy_noise": math.sqrt(info.noise),
+        "max_rank": max_rank(learner.settings),
+        "ridge": info.ridge,
+        "exploring": float(learner.exploring),
+        "rejected": math.nan if info.rejected is None else float(info.rejected),
+        **{seconds_column(stage): round(seconds.get(stage, 0.0), 5) for stage in STAGES},
+    }
