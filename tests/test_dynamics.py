@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.algorithms.streaming import FeatureChanges, PredictedSuccessors
+from kreps.algorithms.streaming import PredictedSuccessors, StateFeatures
 from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
-from kreps.kernels import regression as embedding
 from kreps.kernels.arrays import FloatArray, as_float
 from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.kernel import Kernel, SquaredExponential
-from kreps.kernels.regression import PREDICTION_BATCH, FeatureRegression, KernelEmbedding
+from kreps.kernels.regression import FeatureRegression, KernelEmbedding
 from kreps.models.dynamics import (
     DeltaStateTargets,
     Dynamics,
@@ -49,7 +48,7 @@ def basis_of(data: Transitions, task: TaskSpec = TASK) -> tuple[Kernel, RKHSBasi
     return kernel, *RKHSBasis.fit(kernel, data.points, tolerance=1e-8, max_rank=200)
 
 
-def test_angles_change_the_short_way_round() -> None:
+def test_changes_of_angles_are_wrapped() -> None:
     task = TaskSpec(2, np.array([-1.0]), np.array([1.0]), periodic=(0,))
     observations = np.array([[3.0, 3.0], [-3.0, -3.0], [3.0, 3.0]])
     data = Transitions.from_rollouts([Rollout(observations, np.zeros((2, 1)), np.zeros(2))])
@@ -57,28 +56,28 @@ def test_angles_change_the_short_way_round() -> None:
     np.testing.assert_allclose(state_changes(data, task), [[short, -6.0], [-short, 6.0]])
 
 
-def test_coordinates_that_share_a_lengthscale_share_a_unit() -> None:
+def test_coordinates_that_share_a_lengthscale_share_a_scale() -> None:
     task = TaskSpec(4, np.array([-1.0]), np.array([1.0]), groups=((0, 1),))
     observations = np.zeros((3, 4))
     observations[:, 0] = 0.0, 3.0, 0.0
     observations[:, 1] = 0.0, 4.0, 0.0
-    observations[:, 2] = 0.0, 0.5, 1.0  # and the last one never moves
+    observations[:, 2] = 0.0, 0.5, 1.0  # and the last one is constant
     data = Transitions.from_rollouts(
         [Rollout(observations, np.zeros((2, 1)), np.zeros(2), terminated=True)]
     )
-    delta_targets = DeltaStateTargets.of(data, task)
+    delta_targets = DeltaStateTargets.fit(data, task)
     np.testing.assert_allclose(delta_targets.scale, [12.5**0.5, 12.5**0.5, 0.5, 1.0])
     targets = delta_targets.targets(data, task)
     np.testing.assert_array_equal(targets[:, -1], [0.0, 1.0])
     np.testing.assert_allclose(delta_targets.changes(targets), state_changes(data, task))
-    assert not delta_targets.slopes.any()  # two samples are too few for a trend
+    assert not delta_targets.coefficients.any()  # two samples are too few for a linear mean
 
 
-def test_what_is_linear_is_left_to_the_trend() -> None:
+def test_linear_dynamics_are_predicted_by_the_linear_mean() -> None:
     data = pushes(20)
-    delta_targets = DeltaStateTargets.of(data, TASK)
+    delta_targets = DeltaStateTargets.fit(data, TASK)
     assert np.abs(delta_targets.targets(data, TASK)).max() < 0.02  # 400 samples, and a ridge of one
-    # and goes on as a line where no sample ever was
+    # which extrapolates
     inputs = np.array([[50.0, 40.0, 1.0]])
     np.testing.assert_allclose(
         delta_targets.changes(delta_targets.linear_mean(inputs)),
@@ -87,8 +86,8 @@ def test_what_is_linear_is_left_to_the_trend() -> None:
     )
 
 
-def test_actions_that_hardly_differ_have_no_slope() -> None:
-    """One that is a little off would be all that a slope hangs on."""
+def test_actions_that_hardly_vary_have_no_slope() -> None:
+    """Without a ridge the slope would be determined by one action of 500."""
     rng = np.random.default_rng(0)
     states, actions = rng.normal(size=500), np.ones(500)
     actions[17] = 0.967
@@ -99,23 +98,45 @@ def test_actions_that_hardly_differ_have_no_slope() -> None:
     assert abs(slopes[2, 0]) < 0.02
 
 
-def test_the_trend_is_not_in_angles_nor_in_ends() -> None:
+def test_angles_and_terminations_have_no_slopes() -> None:
     task = TaskSpec(2, np.array([-2.0]), np.array([2.0]), periodic=(0,))
-    slopes = DeltaStateTargets.of(pushes(20, ended=True), task).slopes
+    slopes = DeltaStateTargets.fit(pushes(20, ended=True), task).coefficients
     assert not slopes[1].any()
     assert not slopes[:, -1].any()
     assert slopes[2:, :-1].all()
 
 
-def test_a_coordinate_that_never_changes_has_no_slope() -> None:
+def test_a_constant_coordinate_has_no_slope() -> None:
     rng = np.random.default_rng(0)
     inputs = np.column_stack([rng.normal(size=50), np.full(50, 0.1) * 3.0, np.zeros(50)])
     slopes = linear_least_squares(inputs, 2.0 * inputs[:, :1] + 1.0, TASK)
     np.testing.assert_allclose(slopes, [[1.0], [2.0], [0.0], [0.0]], atol=1e-5)
-    assert not linear_least_squares(inputs[:19], inputs[:19], TASK).any()  # ten for each of two
 
 
-def test_without_noise_it_says_where_any_action_leads() -> None:
+@pytest.mark.parametrize(("samples", "linear"), [(29, False), (30, True)])
+def test_the_linear_mean_needs_ten_samples_for_each_of_its_coefficients(
+    samples: int, linear: bool
+) -> None:
+    # a constant and two slopes: the third input never changes, the angle has no slope
+    task = TaskSpec(3, np.array([-1.0]), np.array([1.0]), periodic=(1,))
+    rng = np.random.default_rng(0)
+    inputs = rng.normal(size=(samples, 4))
+    inputs[:, 2] = 0.3
+    coefficients = linear_least_squares(inputs, inputs[:, :1], task)
+    assert coefficients.any() == linear
+    assert coefficients[1, 0] == pytest.approx(1.0 if linear else 0.0, abs=1e-5)
+    assert not coefficients[2:4].any()
+
+
+@pytest.mark.parametrize(("steps", "linear"), [(19, False), (20, True)])
+def test_the_targets_have_a_linear_mean_from_forty_samples_on_a_line(
+    steps: int, linear: bool
+) -> None:
+    # a constant, and the slopes of position, velocity and force
+    assert DeltaStateTargets.fit(pushes(2, steps), TASK).coefficients.any() == linear
+
+
+def test_without_noise_successors_of_other_actions_are_predicted() -> None:
     data = pushes()
     kernel, basis, features = basis_of(data)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
@@ -130,35 +151,44 @@ def test_without_noise_it_says_where_any_action_leads() -> None:
     assert np.abs(found - features[data.successor]).max() > 0.1  # other actions, other successors
 
 
-@pytest.fixture
-def nothing_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(embedding, "MAX_RESIDUAL_RATIO", 1e-10)
-
-
-def fitted(data: Transitions, kernel: Kernel) -> tuple[Dynamics, KernelEmbedding]:
-    """The dynamics, and an embedding with their parameters that leaves nothing out."""
-    dynamics, x, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+def exact_dynamics(data: Transitions, kernel: Kernel) -> tuple[Dynamics, KernelEmbedding]:
+    """The dynamics with all samples as pivots, and their embedding."""
+    _, x, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
     factors = (*kernel.factors, SquaredExponential((2,)))
     whole = Kernel(factors, np.exp(x[:-1]))
-    return dynamics, KernelEmbedding.fit(whole, state_actions(data, TASK), float(np.exp(x[-1])))
+    model = KernelEmbedding.fit(whole, state_actions(data, TASK), float(np.exp(x[-1])))
+    delta_targets = DeltaStateTargets.fit(data, TASK)
+    targets = delta_targets.targets(data, TASK)
+    residuals = model.leave_one_out(targets).errors
+    return Dynamics(delta_targets, model.predictor(targets), residuals), model
 
 
-@pytest.mark.usefixtures("nothing_left_out")
-def test_of_the_taken_actions_it_expects_the_observed_and_its_mirror_image() -> None:
+def test_few_pivots_predict_as_all_samples_do() -> None:
+    data = pushes(noise=0.3)
+    kernel, _, _ = basis_of(data)
+    dynamics, _, jitter = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
+    exact, _ = exact_dynamics(data, kernel)
+    assert jitter == 0.0
+    inputs = state_actions(data, TASK)
+    np.testing.assert_allclose(dynamics.predict(inputs)[0], exact.predict(inputs)[0], atol=1e-3)
+    np.testing.assert_allclose(dynamics.residuals, exact.residuals, atol=1e-3)
+
+
+def test_expected_features_of_taken_actions_average_the_observation_and_its_mirror_image() -> None:
     data = pushes(noise=0.3)
     kernel, basis, features = basis_of(data)
-    dynamics, model = fitted(data, kernel)
+    dynamics, model = exact_dynamics(data, kernel)
     own, after = features[data.state], features[data.successor]
     start = features[data.start].mean(axis=0)
     expected, errors = expected_features_of_samples(data, basis, own, after, start, dynamics, TASK)
-    # what a model of all other samples says, one by one
+    # the predictions of refits without one sample each
     targets = dynamics.delta_targets.targets(data, TASK)
     for i in range(0, len(data), 17):
         rest = np.arange(len(data)) != i
         refit = type(model).fit(model.kernel, model.inputs[rest], model.regulariser)
-        said = refit.strengths(model.inputs[i : i + 1])[:, 0] @ targets[rest]
-        said += dynamics.delta_targets.linear_mean(model.inputs[i : i + 1])[0]
-        predict = data.states[i] + dynamics.delta_targets.changes(said[None])
+        predicted = refit.strengths(model.inputs[i : i + 1])[:, 0] @ targets[rest]
+        predicted += dynamics.delta_targets.linear_mean(model.inputs[i : i + 1])[0]
+        predict = data.states[i] + dynamics.delta_targets.changes(predicted[None])
         mirrored = 2.0 * predict - data.points[data.successor[i]]
         np.testing.assert_allclose(
             expected[i], 0.5 * (after[i] + basis.features(mirrored)[0]), atol=1e-6
@@ -169,7 +199,7 @@ def test_of_the_taken_actions_it_expects_the_observed_and_its_mirror_image() -> 
         np.testing.assert_array_equal(errors.targets[i], after[i] - own[i])
 
 
-def test_the_spread_is_that_of_the_noise() -> None:
+def test_the_expectation_includes_the_variance_of_the_noise() -> None:
     """Where features are nearly quadratic, their expectation is right on average."""
     noise = 0.2
     data = pushes(60, 20, noise=noise)
@@ -183,8 +213,8 @@ def test_the_spread_is_that_of_the_noise() -> None:
     # E exp(-v^2 / (2 l^2)) of a normal v
     variance = 25.0 + noise**2
     wanted = 5.0 / variance**0.5 * np.exp(-0.5 * velocity**2 / variance)
-    unaware = np.exp(-0.5 * velocity**2 / 25.0)
-    assert abs(np.mean(found - wanted)) < 0.2 * abs(np.mean(unaware - wanted))
+    without_noise = np.exp(-0.5 * velocity**2 / 25.0)
+    assert abs(np.mean(found - wanted)) < 0.2 * abs(np.mean(without_noise - wanted))
 
 
 def velocity_alone(kernel: Kernel) -> Kernel:
@@ -192,22 +222,22 @@ def velocity_alone(kernel: Kernel) -> Kernel:
     return Kernel((SquaredExponential((1,)),), kernel.lengthscales[1:])
 
 
-def test_a_real_end_leads_to_the_start() -> None:
+def test_a_termination_leads_to_the_start() -> None:
     data = pushes(ended=True)
     kernel, basis, features = basis_of(data)
     start = features[data.start].mean(axis=0)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
 
     def always(inputs: FloatArray) -> FloatArray:
-        return np.full((len(inputs), 3), 1.7)  # more than certain
+        return np.full((len(inputs), 3), 1.7)  # a probability above one
 
-    sure = Dynamics(dynamics.delta_targets, always, dynamics.loo_residuals)
-    found = sure.expected_features(basis, start, np.arange(9), state_actions(data, TASK)[:9])
+    certain = Dynamics(dynamics.delta_targets, always, dynamics.loo_residuals)
+    found = certain.expected_features(basis, start, np.arange(9), state_actions(data, TASK)[:9])
     np.testing.assert_allclose(found, np.tile(start, (9, 1)), atol=1e-12)
 
 
-def test_ends_by_chance_are_expected_of_every_step() -> None:
-    """What ended is no more likely to have ended than all else, and that is counted as an error."""
+def test_random_terminations_are_expected_of_every_step() -> None:
+    """Leave-one-out, a terminated step is as likely to terminate as any, which is an error."""
     rng = np.random.default_rng(0)
     rollouts = []
     for _ in range(400):
@@ -233,8 +263,8 @@ def test_ends_by_chance_are_expected_of_every_step() -> None:
     assert errors.mean_square == pytest.approx(wanted, rel=0.15)
 
 
-def test_the_end_of_a_task_is_foreseen() -> None:
-    """It ends beyond a line, and a policy that crosses it is told so."""
+def test_terminations_beyond_a_line_are_predicted() -> None:
+    """The task terminates where the position exceeds 0.5."""
     rng = np.random.default_rng(0)
     rollouts = []
     for _ in range(150):
@@ -253,44 +283,47 @@ def test_the_end_of_a_task_is_foreseen() -> None:
     assert found[0].mean() > 6.0 > 3.0 > found[1].mean()
 
 
-def test_many_inputs_are_predicted_block_by_block() -> None:
+def test_many_inputs_are_predicted_in_batches() -> None:
     data = pushes(noise=0.1)
     kernel, basis, features = basis_of(data)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
-    rows = np.random.default_rng(3).integers(len(data), size=PREDICTION_BATCH + 7)
+    rows = np.random.default_rng(3).integers(len(data), size=2048 + 7)
     inputs = state_actions(data, TASK)[rows]
     found = dynamics.expected_features(basis, features[0], rows, inputs)
     last = dynamics.expected_features(basis, features[0], rows[-7:], inputs[-7:])
     np.testing.assert_allclose(found[-7:], last, atol=1e-12)
 
 
-@pytest.mark.usefixtures("nothing_left_out")
 @pytest.mark.parametrize("ended", [False, True])
-def test_chunks_are_told_of_the_observed_and_its_mirror_image(ended: bool) -> None:
+def test_expected_features_of_chunks_average_the_observation_and_its_mirror_image(
+    ended: bool,
+) -> None:
     data = pushes(noise=0.3, ended=ended)
     kernel, basis, features = basis_of(data)
-    dynamics, model = fitted(data, kernel)
+    dynamics, model = exact_dynamics(data, kernel)
     start = features[data.start].mean(axis=0)
     regression = FeatureRegression(dynamics.regression, 0.0)
-    changes = FeatureChanges(basis, start, as_float)
-    own, expected = PredictedSuccessors(changes, dynamics.delta_targets, regression, TASK)(data)
+    state_features = StateFeatures(basis, start, as_float)
+    own, expected = PredictedSuccessors(state_features, dynamics.delta_targets, regression, TASK)(
+        data
+    )
     np.testing.assert_allclose(own, features[data.state], atol=1e-8)
-    said = model.expected_features(dynamics.delta_targets.targets(data, TASK))
-    said += dynamics.delta_targets.linear_mean(state_actions(data, TASK))
-    predict = data.states + dynamics.delta_targets.changes(said)
+    predicted = model.expected_features(dynamics.delta_targets.targets(data, TASK))
+    predicted += dynamics.delta_targets.linear_mean(state_actions(data, TASK))
+    predict = data.states + dynamics.delta_targets.changes(predicted)
     mirrored = basis.features(2.0 * predict - data.points[data.successor])
     spread = 0.5 * (features[data.successor] + mirrored)
-    ends = np.clip(said[:, -1:], 0.0, 1.0)
+    ends = np.clip(predicted[:, -1:], 0.0, 1.0)
     assert (ends.max() > 0.01) == ended
     np.testing.assert_allclose(expected, spread + ends * (start - spread), atol=1e-6)
 
 
-def test_rounding_is_not_learnt() -> None:
+def test_rounding_errors_are_not_scaled_up() -> None:
     still = 1.0 + 3e-16 * np.random.default_rng(0).integers(-1, 2, size=(4, 1))
     observations = np.column_stack([np.arange(4.0), still])
     data = Transitions.from_rollouts([Rollout(observations, np.zeros((3, 1)), np.zeros(3))])
-    np.testing.assert_allclose(DeltaStateTargets.of(data, TASK).scale, [1.0, 1.0])
+    np.testing.assert_allclose(DeltaStateTargets.fit(data, TASK).scale, [1.0, 1.0])
 
 
-def test_the_default_recipe_learns_of_it() -> None:
+def test_the_default_model_is_the_dynamics() -> None:
     assert kreps.KREPS(TASK).settings.model == "dynamics"

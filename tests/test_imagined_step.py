@@ -285,7 +285,7 @@ def test_the_ridge_is_the_error_of_refits_without_each_sample(model: Any) -> Non
     if model == "change":
         errors = errors_of_refits(embedding, targets)
     else:
-        delta_targets = DeltaStateTargets.of(data, TASK)
+        delta_targets = DeltaStateTargets.fit(data, TASK)
         loo_residuals = errors_of_refits(embedding, delta_targets.targets(data, TASK))
         predicted = basis.features(
             data.points[data.successor] - delta_targets.changes(loo_residuals)

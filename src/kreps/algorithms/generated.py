@@ -18,7 +18,7 @@ from kreps.algorithms.acceptance import proposal_std_scale, temperature_floor
 from kreps.algorithms.dual import DualProblem
 from kreps.kernels.arrays import FloatArray, IntArray
 from kreps.kernels.sampling import systematic_resampling
-from kreps.models.dynamics import after_ends
+from kreps.models.dynamics import with_terminations
 from kreps.models.transition import feature_differences
 from kreps.models.world_model import WorldModel
 from kreps.policies.base import StochasticPolicy
@@ -133,5 +133,5 @@ def expected_outcomes(
     if world.bonus is not None:
         novelty = world.novelty(inputs)
         rewards = rewards + novelty * world.bonus.exploration_bonus(restart_probability)
-        expected = after_ends(expected, novelty[:, None], world.restart)
+        expected = with_terminations(expected, novelty[:, None], world.restart)
     return rewards, expected

@@ -1,7 +1,8 @@
 """The lines of Algorithm 1 on any number of samples, in features in place of kernels.
 
-Centres are chosen by pivoted Cholesky on a subsample in memory; every sum over samples is taken
-chunk by chunk, on the workers and in the arrays that `kreps.Compute` names.
+Centres are chosen by pivoted Cholesky, and hyper-parameters fitted, on a subsample in memory.  Sums
+over all samples are computed chunk by chunk, by the workers and on the device of `kreps.Compute`.
+The cost is linear in the number of samples.
 """
 
 from __future__ import annotations
@@ -13,13 +14,7 @@ from operator import add
 
 import numpy as np
 
-from kreps.algorithms.dual import (
-    DualProblem,
-    DualSolution,
-    effective_sample_size,
-    standardise,
-)
-from kreps.algorithms.newton import solve_dual
+from kreps.algorithms.dual import DualSolution, effective_sample_size, standardise
 from kreps.algorithms.policy_targets import (
     MIN_RELATIVE_WEIGHT,
     PolicyFit,
@@ -29,6 +24,7 @@ from kreps.algorithms.policy_targets import (
 )
 from kreps.algorithms.reps import Expectation, ValueFeatures, stationarity_ridge
 from kreps.algorithms.state import Stopwatch
+from kreps.algorithms.streamed_dual import StreamedProblem, coarse_to_fine
 from kreps.algorithms.streaming import (
     BellmanRows,
     ChunkPolicySums,
@@ -36,26 +32,26 @@ from kreps.algorithms.streaming import (
     DeltaStateSums,
     EmbeddedSuccessors,
     EmbeddingSums,
-    FeatureChanges,
+    ExpectedSuccessors,
     ObservedSuccessors,
     PredictedSuccessors,
     StartFeatures,
-    StreamedProblem,
-    Successors,
+    StateFeatures,
 )
 from kreps.data.compute import Compute
 from kreps.data.dataset import Chunk, Dataset
 from kreps.data.rollouts import Rollout
 from kreps.data.window import ReplayWindow
-from kreps.kernels.arrays import FloatArray, IntArray, as_float
+from kreps.kernels.arrays import FloatArray, as_float
 from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.regression import FeatureRegression, LeaveOneOut, RegressionSums
+from kreps.kernels.sampling import uniform_subsample
 from kreps.models.dynamics import (
     DeltaStateTargets,
     Dynamics,
-    after_ends,
     expected_features_of_samples,
+    with_terminations,
 )
 from kreps.models.transition import (
     embedding_hyperparameters,
@@ -68,26 +64,23 @@ from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 from kreps.policies.sparse_gp import PolicySums, SparseGP
 from kreps.settings import Grid, LowRank, Settings
 
-TOLERANCE = 1e-6
-"""Bases of state-actions and of the policy are complete when no input in memory has a larger
-squared residual."""
-
-GROWTH = 4
-"""Factor by which the number of chunks grows from one solve of the dual to the next."""
+RESIDUAL_TOLERANCE = 1e-6
+"""Bases of state-actions and of the policy are complete if the squared residual of every input in
+memory is at most this; the kernels are at most one."""
 
 
 @dataclass(frozen=True)
 class StreamedFeatures(ValueFeatures):
-    """The same, and what computes features of any chunk."""
+    """Features of V at the samples in memory, and the function that computes those of a chunk."""
 
-    changes: FeatureChanges
+    state_features: StateFeatures
 
 
 @dataclass(frozen=True)
 class StreamedExpectation(Expectation):
-    """The same, and what computes expected features of any chunk."""
+    """Predictions for the samples in memory, and the model that computes those of a chunk."""
 
-    successors: Successors
+    successors: ExpectedSuccessors
 
 
 Regressed = tuple[FeatureRegression, LeaveOneOut, FloatArray]
@@ -95,7 +88,15 @@ Regressed = tuple[FeatureRegression, LeaveOneOut, FloatArray]
 
 
 class LowRankBatch:
-    """All samples of the window or of a data set, of which a subsample is held in memory.
+    """All samples of the replay window or of a data set, of which a subsample is in memory.
+
+    Args:
+        window: with the new rollouts.
+        samples: the new rollouts, or a data set to learn from instead of the window.
+        settings, low_rank: of the learner.
+        clock: of the update.
+        compute: workers and device.
+        rng: draws the subsample.
 
     Raises:
         DataError: a chunk with observations or actions of another width than the task's.
@@ -124,7 +125,7 @@ class LowRankBatch:
         self.all_rewards, self.reward_unit = standardise(
             np.concatenate([rewards for rewards, _ in read])
         )
-        self.in_memory = subsample(np.arange(self.size), low_rank.subsample, rng)
+        self.in_memory = uniform_subsample(self.size, rng, low_rank.subsample)
         self.data = self.dataset.take(self.in_memory)
         self.rewards = self.all_rewards[self.in_memory]
         if isinstance(samples, Dataset):
@@ -143,10 +144,10 @@ class LowRankBatch:
             kernel = with_wrap_discontinuity(kernel, data, self.task, value)
             basis = self._centres(kernel, data.points, value.max_rank, value.tolerance)
         sums = reduce(add, self.compute.map(StartFeatures(basis, to_device), self.dataset.chunks))
-        changes = FeatureChanges(basis, sums[:-1] / int(sums[-1]), to_device)
-        own, observed = replace(changes, to_device=as_float).observed(data)
+        state_features = StateFeatures(basis, sums[:-1] / int(sums[-1]), to_device)
+        own, observed = replace(state_features, to_device=as_float).observed(data)
         self.clock.lap("basis")
-        return StreamedFeatures(basis, own, observed, changes.start, changes)
+        return StreamedFeatures(basis, own, observed, state_features.start, state_features)
 
     def transition_model(
         self,
@@ -170,11 +171,11 @@ class LowRankBatch:
         rng: np.random.Generator,
     ) -> StreamedExpectation:
         """Features of V at the successor that a regression of the state's change predicts."""
-        data, task, changes = self.data, self.task, features.changes
-        targets = DeltaStateTargets.of(data, task)
+        data, task, state_features = self.data, self.task, features.state_features
+        targets = DeltaStateTargets.fit(data, task)
         model, errors, x = self._regressed(
             targets.targets(data, task),
-            lambda basis: DeltaStateSums(targets, basis, task, changes.to_device),
+            lambda basis: DeltaStateSums(targets, basis, task, state_features.to_device),
             kernel,
             start,
             rng,
@@ -184,7 +185,7 @@ class LowRankBatch:
             data, features.basis, features.own, features.observed, features.start, dynamics, task
         )
         for_actions = partial(dynamics.expected_features, features.basis, features.start)
-        successors = PredictedSuccessors(changes, targets, model, task)
+        successors = PredictedSuccessors(state_features, targets, model, task)
         return StreamedExpectation(expected, errors, for_actions, x, dynamics, successors)
 
     def _embedding(
@@ -195,16 +196,18 @@ class LowRankBatch:
         rng: np.random.Generator,
     ) -> StreamedExpectation:
         """Eq. 4 on the features of successors, as printed or less those of the state itself."""
-        data, task, changes, own = self.data, self.task, features.changes, features.own
-        ended = data.terminated[:, None].astype(np.float64)
-        after = after_ends(features.observed, ended, features.start)
+        data, task, own = self.data, self.task, features.own
+        state_features = features.state_features
+        terminated = data.terminated[:, None].astype(np.float64)
+        after = with_terminations(features.observed, terminated, features.start)
         if self.settings.model == "sample":
-            return StreamedExpectation(after, None, None, None, None, ObservedSuccessors(changes))
+            successors = ObservedSuccessors(state_features)
+            return StreamedExpectation(after, None, None, None, None, successors)
         relative = self.settings.model == "change"
         origin = own if relative else np.zeros_like(own)
         model, errors, x = self._regressed(
             after - origin,
-            lambda basis: EmbeddingSums(changes, basis, task, relative),
+            lambda basis: EmbeddingSums(state_features, basis, task, relative),
             kernel,
             start,
             rng,
@@ -215,7 +218,7 @@ class LowRankBatch:
             lambda rows, inputs: origin[rows] + model.mean(inputs),
             x,
             None,
-            EmbeddedSuccessors(changes, model, task, relative),
+            EmbeddedSuccessors(state_features, model, task, relative),
         )
 
     def _regressed(
@@ -230,7 +233,8 @@ class LowRankBatch:
 
         Args:
             targets: (m, r) of the samples in memory.
-            sums_in: what a chunk adds, given the features of states and actions.
+            sums_in: maps features of states and actions to the function of a chunk that computes
+                its sums.
             kernel, start, rng: as of `transition_model`.
         """
         inputs = state_actions(self.data, self.task)
@@ -272,7 +276,8 @@ class LowRankBatch:
     ) -> PolicyFit:
         weights = np.where(self.size * p >= MIN_RELATIVE_WEIGHT, p, 0.0)
         weights = weights * effective_sample_size(p)
-        rows = subsample(np.flatnonzero(weights), self.low_rank.subsample, rng)
+        positive = np.flatnonzero(weights)
+        rows = positive[uniform_subsample(len(positive), rng, self.low_rank.subsample)]
         part = self.dataset.take(rows)
         targets = PolicyTargets(
             part.states,
@@ -347,55 +352,7 @@ class LowRankBatch:
         return self._centres(kernel.with_lengthscales(np.exp(x[:-2])), targets.states, rank)
 
     def _centres(
-        self, kernel: Kernel, points: FloatArray, rank: int, tolerance: float = TOLERANCE
+        self, kernel: Kernel, points: FloatArray, rank: int, tolerance: float = RESIDUAL_TOLERANCE
     ) -> RKHSBasis:
-        """At most ``rank`` features of a kernel, centred at some of the points (m, d)."""
+        """At most ``rank`` features of a kernel, whose centres are pivots among points (m, d)."""
         return RKHSBasis.fit(kernel, points, tolerance=tolerance, max_rank=rank)[0]
-
-
-def subsample(rows: IntArray, size: int, rng: np.random.Generator) -> IntArray:
-    """At most ``size`` of the row numbers, uniformly without replacement, in order."""
-    if len(rows) <= size:
-        return rows
-    return np.sort(rng.choice(rows, size, replace=False))
-
-
-def coarse_to_fine(
-    problem: StreamedProblem,
-    ridge: float,
-    differences: FloatArray,
-    in_memory: IntArray,
-    subsample_size: int,
-) -> DualSolution:
-    """The dual on the samples in memory, then on more and more chunks.
-
-    Each solve starts from the solution before it.  A pass over all samples costs much more than one
-    over a few, so Newton's method should begin there near its end.
-
-    Args:
-        problem: of all samples.
-        ridge: rho times the number of samples.
-        differences: (m, r) rows of B of the samples in memory.
-        in_memory: (m,) their numbers.
-        subsample_size: largest number of samples in memory.
-    """
-    n = len(problem.rewards)
-    near = DualProblem(
-        rewards=problem.rewards[in_memory],
-        differences=differences,
-        kl_bound=problem.kl_bound,
-        ridge=ridge / min(GROWTH * len(in_memory), n),
-        eta_floor=problem.eta_floor,
-    )
-    dual = solve_dual(near)
-    if len(in_memory) == n:
-        return dual
-    stride = 1
-    while n >= 2 * GROWTH * stride * subsample_size:
-        stride *= GROWTH
-    while stride:
-        part = problem.part(slice(None, None, stride))
-        part = replace(part, ridge=ridge / min(GROWTH * len(part.rewards), n))
-        dual = solve_dual(part, start=(dual.eta, dual.theta))
-        stride //= GROWTH
-    return dual

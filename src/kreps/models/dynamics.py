@@ -1,19 +1,18 @@
-"""The transition model of the default recipe: where a state moves to, and how far that may be off.
+"""The dynamics model: a regression of the change of state, and expected features from it.
 
-Eq. 4 learns what becomes of each feature of V by itself, hundreds of them, though all are functions
-of one successor.  Here the change of the state is what is regressed: a linear trend first, then
-what it leaves (with the machinery of Eq. 4: the same kernel over states and actions, the same
-leave-one-out fit).  V's features are taken at the successor that both predict.
+Eq. 4 regresses hundreds of features of V separately, although all are functions of one successor.
+Here the change of state is regressed instead: its linear mean by ridge regression, then the
+remainder with the kernel, the leave-one-out fit and the regulariser of Eq. 4.  The features of V
+are computed at the predicted successor.
 
-Features at a predicted successor are not yet expected features: noise is missing, and a V that
-knows nothing of noise will be fitted to it.  What the regression of all other samples misses of a
-sample is a draw of that noise, in that very state.  So successors are spread to both sides by it,
+Features at the mean successor are not yet expected features, as the noise is missing.  The
+leave-one-out residual ``e_i`` of a sample is a draw of the noise at its state, so
 
-    ``E[phi(s')] = (phi(s^ + e_i) + phi(s^ - e_i)) / 2``,
+    ``E[phi(s')] = (phi(s^ + e_i) + phi(s^ - e_i)) / 2``
 
-which has the right mean and, on average over samples, the right variance: all that counts while V
-is nearly quadratic over the reach of the noise.  For the action that was taken these two are the
-observed successor and its mirror image in the predicted one.
+at the predicted successor ``s^``.  Both have the mean ``s^``, and on average over samples the
+variance of the noise; this is exact where V is quadratic within the range of the noise.  For the
+action that was taken, the two are the observed successor and its mirror image at ``s^``.
 """
 
 from __future__ import annotations
@@ -32,110 +31,129 @@ from kreps.kernels.kernel import Kernel
 from kreps.kernels.regression import PREDICTION_BATCH, LeaveOneOut
 from kreps.models.transition import fit_regression, state_actions
 
+CONSTANT_RTOL = 1e-12
+"""A coordinate whose standard deviation, or root mean square change, is below this share of its
+largest absolute value is constant: its changes are rounding errors."""
+
+SAMPLES_PER_COEFFICIENT = 10
+"""Smallest number of samples per coefficient of the linear mean; with fewer it is zero.  The slopes
+of few samples are uncertain, and predictions far from the data extrapolate them."""
+
+STATE_RIDGE = 1e-6
+"""Ridge of the linear mean per sample, for states of unit variance.  It only makes the normal
+equations well-conditioned."""
+
+ACTION_RIDGE = 1.0
+"""Ridge of the linear mean for actions in units of their scale, for all samples together.  Slopes
+of actions that hardly varied in the data are shrunk to zero, as predictions for the whole range of
+actions would extrapolate them."""
+
 
 def state_changes(data: Transitions, task: TaskSpec) -> FloatArray:
-    """``s'_i - s_i``, (n, ds); angles go the short way round."""
+    """``s'_i - s_i``, (n, ds); those of angles are wrapped to [-pi, pi)."""
     changes = data.points[data.successor] - data.states
     angles = list(task.periodic)
     changes[:, angles] = (changes[:, angles] + np.pi) % (2.0 * np.pi) - np.pi
     return changes
 
 
-ROUNDING = 1e-12
-"""Changes below this share of a coordinate's size are none: its rounding is not to be learnt."""
-
-SAMPLES_PER_COEFFICIENT = 10
-"""Least number of samples for each coefficient of a trend; with fewer there is none."""
-
-LINEAR_RIDGE = 1e-6
-"""Of a trend's least squares, a sample, for states of unit variance: as good as none."""
-
-ACTION_RIDGE = 1.0
-"""The same in all, for actions in units of their scale: those that hardly differed in the data say
-nothing of how a whole range of them would act, which is what will be asked."""
-
-
 @dataclass(frozen=True)
 class DeltaStateTargets:
-    """What is regressed: changes of state as numbers of order one, less a trend; and real ends.
+    """Targets of the regression: scaled changes of state less their linear mean; and terminations.
 
-    A kernel regression fades to nothing far from the data and follows a slope only where samples
-    are dense.  But most of what moves a mechanism is a slope: a position changes with the velocity,
-    a velocity with the force.  So a straight line in all coordinates but angles goes first; it is
-    of all samples, the one that is left out elsewhere among them.
+    Far from the data a kernel regression predicts zero, and it follows a slope only where samples
+    are dense.  In mechanical systems most of the change is linear: a position changes with the
+    velocity, a velocity with the force.  So a linear function of all coordinates but angles is
+    subtracted first.  It is fitted to all samples once; leave-one-out errors are of the kernel
+    regression alone.
 
     Attributes:
-        unit: (ds,) root mean square change, one for all coordinates that share a lengthscale.
-        slopes: (1 + ds + da, ds + 1) of the trend: its constant, then those of states and actions.
+        scale: (ds,) root mean square changes; coordinates that share a lengthscale share one.
+        coefficients: (1 + ds + da, ds + 1) of the linear mean: its constants, then the slopes in
+            states and actions.  Those of terminations, the last column, are zero.
     """
 
     scale: FloatArray
-    slopes: FloatArray
+    coefficients: FloatArray
 
     @classmethod
-    def of(cls, data: Transitions, task: TaskSpec) -> DeltaStateTargets:
+    def fit(cls, data: Transitions, task: TaskSpec) -> DeltaStateTargets:
+        """Scale and linear mean of n transitions."""
         scale = np.ones(task.observation_size)
         changes = state_changes(data, task)
         squares = np.mean(changes**2, axis=0)
         for factor in task.state_factors:
             dims = list(factor.dims)
-            size = np.sqrt(np.mean(squares[dims]))
-            if size > ROUNDING * np.abs(data.points[:, dims]).max():
-                scale[dims] = size
-        slopes = linear_least_squares(state_actions(data, task), changes / scale, task)
-        return cls(scale, np.column_stack([slopes, np.zeros(len(slopes))]))
+            root_mean_square = np.sqrt(np.mean(squares[dims]))
+            if root_mean_square > CONSTANT_RTOL * np.abs(data.points[:, dims]).max():
+                scale[dims] = root_mean_square
+        coefficients = linear_least_squares(state_actions(data, task), changes / scale, task)
+        return cls(scale, np.column_stack([coefficients, np.zeros(len(coefficients))]))
 
     def targets(self, data: Transitions, task: TaskSpec) -> FloatArray:
-        """What is regressed of n transitions, (n, ds + 1)."""
+        """The targets (n, ds + 1) of n transitions."""
         whole = np.column_stack([state_changes(data, task) / self.scale, data.terminated])
         return whole - self.linear_mean(state_actions(data, task))
 
     def linear_mean(self, inputs: Array) -> Array:
-        """What is not regressed, (n, ds + 1), of states and applied actions (n, ds + da)."""
-        used = np.flatnonzero(self.slopes[1:].any(axis=1))  # of 800 pixels mostly none
-        slopes = self.slopes[1:][used]
-        return columns(inputs, used) @ like(slopes, inputs) + like(self.slopes[0], inputs)
+        """The linear mean (n, ds + 1) of states and scaled, applied actions (n, ds + da)."""
+        used = np.flatnonzero(self.coefficients[1:].any(axis=1))  # few, if states are images
+        slopes = self.coefficients[1:][used]
+        return columns(inputs, used) @ like(slopes, inputs) + like(self.coefficients[0], inputs)
 
-    def changes(self, targets: Array) -> Array:
-        """Changes of state (n, ds) of targets and trend together (n, ds + 1)."""
-        return targets[:, :-1] * like(self.scale, targets)
+    def changes(self, predictions: Array) -> Array:
+        """Changes of state (n, ds), from targets plus linear mean (n, ds + 1)."""
+        return predictions[:, :-1] * like(self.scale, predictions)
 
 
 def linear_least_squares(inputs: FloatArray, targets: FloatArray, task: TaskSpec) -> FloatArray:
-    """Constant and slopes (1 + d, k) of targets (n, k) as linear functions of inputs (n, d).
+    """Ridge regression of targets (n, k) on inputs (n, d): constants and slopes (1 + d, k).
 
-    Zero for angles and for what never changes, and all of them where there are too few samples.
+    Slopes of angles and of constant inputs are zero.  All coefficients are zero with fewer than
+    `SAMPLES_PER_COEFFICIENT` samples for the constant and each of the other slopes.
+
+    Args:
+        inputs: states and scaled, applied actions.
+        targets: of the regression.
+        task: which inputs are states, and which of these are angles.
     """
-    slopes = np.zeros((1 + inputs.shape[1], targets.shape[1]))
+    coefficients = np.zeros((1 + inputs.shape[1], targets.shape[1]))
     scale = inputs.std(axis=0)
-    used = scale > ROUNDING * np.abs(inputs).max(axis=0)
+    used = scale > CONSTANT_RTOL * np.abs(inputs).max(axis=0)
     used[list(task.periodic)] = False
     if len(inputs) < SAMPLES_PER_COEFFICIENT * (1 + np.count_nonzero(used)):
-        return slopes
-    ridge = np.full(inputs.shape[1], LINEAR_RIDGE * len(inputs))
+        return coefficients
+    ridge = np.full(inputs.shape[1], STATE_RIDGE * len(inputs))
     scale[task.observation_size :], ridge[task.observation_size :] = 1.0, ACTION_RIDGE
     centre = inputs[:, used].mean(axis=0)
     z = (inputs[:, used] - centre) / scale[used]
     product = z.T @ (targets - targets.mean(axis=0))
-    slopes[1:][used] = np.linalg.solve(z.T @ z + np.diag(ridge[used]), product) / scale[used, None]
-    slopes[0] = targets.mean(axis=0) - centre @ slopes[1:][used]
-    return slopes
+    slopes = np.linalg.solve(z.T @ z + np.diag(ridge[used]), product) / scale[used, None]
+    coefficients[1:][used] = slopes
+    coefficients[0] = targets.mean(axis=0) - centre @ slopes
+    return coefficients
 
 
-def after_ends(features: Array, ends: Array, start: FloatArray) -> Array:
-    """Features (n, r) of successors, replaced by those of the start in a share of ends (n, 1)."""
-    return features + ends * (like(start, features) - features)
+def with_terminations(features: Array, probabilities: Array, start: FloatArray) -> Array:
+    """Expected features of successors, if a start state follows a termination.
+
+    Args:
+        features: (n, r) of the successors without a termination.
+        probabilities: (n, 1) of a termination.
+        start: (r,) mean features of the start states.
+    """
+    return features + probabilities * (like(start, features) - features)
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """A regression of the change of state, and what it misses.
+    """The dynamics model of n samples.
 
     Attributes:
-        motion: units of what is regressed.
-        predict: its targets (m, ds + 1) of states and scaled, applied actions (m, ds + da), but for
-            the trend.
-        missed: (n, ds + 1) targets of n samples less what all others predict of them.
+        delta_targets: scale and linear mean of the targets.
+        regression: predicts targets (m, ds + 1) from states and scaled, applied actions
+            (m, ds + da).
+        loo_residuals: (n, ds + 1) leave-one-out errors of the targets.
     """
 
     delta_targets: DeltaStateTargets
@@ -144,24 +162,34 @@ class Dynamics:
 
     @cached_property
     def residuals(self) -> FloatArray:
-        """Changes of state (n, ds) less what all other samples predict of them."""
+        """Leave-one-out errors (n, ds) of the changes of state, in units of the state."""
         return self.delta_targets.changes(self.loo_residuals)
 
     def predict(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Successors (m, ds) and shares of real ends (m, 1) of inputs (m, ds + da), on average."""
-        targets = self.delta_targets.linear_mean(inputs) + self.regression(inputs)
+        """Mean successors (m, ds) and probabilities of termination (m, 1).
+
+        Args:
+            inputs: (m, ds + da) states and scaled, applied actions.
+        """
+        predictions = self.delta_targets.linear_mean(inputs) + self.regression(inputs)
         states = inputs[:, : self.residuals.shape[1]]
-        return states + self.delta_targets.changes(targets), np.clip(targets[:, -1:], 0.0, 1.0)
+        successors = states + self.delta_targets.changes(predictions)
+        return successors, np.clip(predictions[:, -1:], 0.0, 1.0)
 
     def sample(
         self, rows: IntArray, inputs: FloatArray, residual_signs: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """One successor (m, ds) each, with the noise of samples (m,); and shares of ends (m,).
+        """Successors (m, ds) with noise, and probabilities of termination (m,).
 
-        To which sides (m, 1), plus or minus one, is for the caller to draw.
+        The noise is a residual of a sample with a random sign (wild bootstrap).
+
+        Args:
+            rows: (m,) samples whose residuals are taken.
+            inputs: (m, ds + da) states and scaled, applied actions.
+            residual_signs: (m, 1) one or minus one, drawn by the caller.
         """
-        successors, ends = self.predict(inputs)
-        return successors + residual_signs * self.residuals[rows], ends[:, 0]
+        successors, terminations = self.predict(inputs)
+        return successors + residual_signs * self.residuals[rows], terminations[:, 0]
 
     def expected_features(
         self, basis: Basis, start: FloatArray, rows: IntArray, inputs: FloatArray
@@ -170,18 +198,19 @@ class Dynamics:
 
         Args:
             basis: of V.
-            start: (r,) mean features of the start states: what follows a real end.
-            rows: (m,) the samples whose states the actions are taken in, or that are nearest.
+            start: (r,) mean features of the start states, which follow a termination.
+            rows: (m,) samples whose states the actions are taken in or nearest to; the noise is
+                that of these samples.
             inputs: (m, ds + da) states and scaled, applied actions.
         """
         expected = np.empty((len(rows), len(start)))
         for first in range(0, len(rows), PREDICTION_BATCH):
-            block = slice(first, first + PREDICTION_BATCH)
-            successors, ends = self.predict(inputs[block])
-            residuals = self.residuals[rows[block]]
-            spread = 0.5 * basis.features(successors + residuals)
-            spread += 0.5 * basis.features(successors - residuals)
-            expected[block] = after_ends(spread, ends, start)
+            batch = slice(first, first + PREDICTION_BATCH)
+            successors, terminations = self.predict(inputs[batch])
+            residuals = self.residuals[rows[batch]]
+            averaged = 0.5 * basis.features(successors + residuals)
+            averaged += 0.5 * basis.features(successors - residuals)
+            expected[batch] = with_terminations(averaged, terminations, start)
         return expected
 
 
@@ -199,19 +228,24 @@ def expected_features_of_samples(
     Args:
         data: n transitions.
         basis: of V.
-        own, observed: (n, r) features of each state and of its successor, whether or not the task
-            ended there.
-        start: (r,) mean features of the start states: what follows a real end.
+        own: (n, r) features of each state.
+        observed: (n, r) features of each successor, also where the task terminated.
+        start: (r,) mean features of the start states, which follow a termination.
         dynamics: of these transitions.
         task: which coordinates are angles.
+
+    Returns:
+        The expected features, and the errors of the features at the mean successor that the other
+        samples predict, relative to the features of the state.
     """
     terminated = data.terminated[:, None].astype(np.float64)
-    ends = np.clip(terminated - dynamics.loo_residuals[:, -1:], 0.0, 1.0)
-    predict = data.states + state_changes(data, task) - dynamics.residuals
-    spread = 0.5 * (observed + basis.features(predict - dynamics.residuals))
-    after = after_ends(observed, terminated, start)
-    foreseen = after_ends(basis.features(predict), ends, start)
-    return after_ends(spread, ends, start), LeaveOneOut(after - own, after - foreseen)
+    probabilities = np.clip(terminated - dynamics.loo_residuals[:, -1:], 0.0, 1.0)
+    predicted = data.states + state_changes(data, task) - dynamics.residuals
+    averaged = 0.5 * (observed + basis.features(predicted - dynamics.residuals))
+    targets = with_terminations(observed, terminated, start)
+    predictions = with_terminations(basis.features(predicted), probabilities, start)
+    errors = LeaveOneOut(targets - own, targets - predictions)
+    return with_terminations(averaged, probabilities, start), errors
 
 
 def fit_dynamics(
@@ -221,11 +255,19 @@ def fit_dynamics(
     start: FloatArray | None,
     rng: np.random.Generator,
 ) -> tuple[Dynamics, FloatArray, float]:
-    """The regression of n transitions, its log parameters, and the jitter of its factorisation.
+    """The dynamics of n transitions, at a cost of n^3 or less (`fit_regression`).
 
-    Arguments are those of `kreps.algorithms.transition_model.fit_regression`, but for the targets.
+    Args:
+        data: n transitions.
+        state_kernel: over states, at median lengthscales.
+        task: limits and scale of the actions, and which coordinates are angles.
+        start: log hyper-parameters (g + da + 1,) of the last fit, if there was one.
+        rng: draws the samples of the fit.
+
+    Returns:
+        The dynamics, the log hyper-parameters of the fit, and the jitter of the factorisation.
     """
-    delta_targets = DeltaStateTargets.of(data, task)
+    delta_targets = DeltaStateTargets.fit(data, task)
     targets = delta_targets.targets(data, task)
     model, x = fit_regression(data, targets, state_kernel, task, start, rng)
     loo_residuals = model.leave_one_out(targets).errors

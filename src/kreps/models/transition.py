@@ -1,9 +1,11 @@
-"""The conditional embedding fitted to a window of transitions, as several methods need it.
+"""Kernels over states and actions, and regressions on them: the transition model of Eq. 4.
 
-And what every step of REPS makes of it: the differences of features, restarts included.
+These are shared by REPS, value iteration and the dynamics model.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,15 +19,35 @@ from kreps.kernels.sampling import effective_target_count, pps_subsample
 from kreps.settings import RKHS, Grid
 
 WRAP_LENGTHSCALE = np.pi
-"""Of the numbers of angles in V's kernel, rad: a turn apart, states are ``exp(-2)`` alike, so that
-V can jump there, and little is lost where it need not."""
+"""Lengthscale, rad, of the distance between wrapped angles in V's kernel.  States on either side of
+the discontinuity, 2 pi apart, have a similarity of ``exp(-2)``: V can jump there.  Where it does
+not jump, little resolution is lost."""
 
 UNWRAPPED_LENGTHSCALE = 1e6
-"""The same, rad, where angles count their turns: all of one turn are alike."""
+"""The same where angles are not wrapped but count whole turns: all angles are similar."""
+
+REGULARISER = 1e-3
+"""Prior mean of the regulariser lambda, for a kernel of at most one."""
+
+REGULARISER_OF_NOISY_DATA = 0.1
+"""Lambda of a second start point, from which the search begins if the loss is smaller there: that
+of noisy targets."""
+
+REGULARISER_RANGE = (1e-6, 1.0)
+"""Limits of lambda: the smallest one keeps the Gram matrix of repeated samples well-conditioned,
+the largest one predicts half of a target at its own isolated sample."""
+
+LOG_LENGTHSCALE_RANGE = 3.0
+"""Largest distance of a log lengthscale from that of the median distance."""
+
+LOG_LENGTHSCALE_STD = 1.0
+LOG_REGULARISER_STD = 3.0
+"""Prior standard deviations.  That of the regulariser is large, as noise levels differ by orders of
+magnitude between tasks."""
 
 
 def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) -> Kernel:
-    """The kernel over states at the median lengthscales."""
+    """The kernel over states at median lengthscales."""
     factors = task.state_factors
     return Kernel(factors, median_lengthscales(factors, data.points, rng))
 
@@ -35,29 +57,31 @@ def with_wrap_discontinuity(
 ) -> Kernel:
     """The kernel over states of V and of the reward model, which may jump where an angle wraps.
 
-    A reward is often a function of the angle's number, such as ``-theta^2``, and jumps from one end
-    of the turn to the other.  So does V.  Dynamics and good actions are periodic.
+    A reward is often a function of the wrapped angle, such as ``-theta^2``, and jumps where the
+    angle does.  So does V.  Dynamics and policies are periodic and keep the periodic kernel.
+
+    The wrap point is in the middle of the gap that the observed angles leave in the circle.  Angles
+    that count whole turns leave no gap, and they get no discontinuity.
 
     Args:
         kernel: over states, at V's lengthscales.
-        data: its angles leave a gap of the turn, in whose middle the numbers wrap.  An angle that
-            counts its turns leaves none and gets no discontinuity.
+        data: its angles.
         task: which coordinates are angles.
-        value: ``angle_wrap``; without effect where that is continuous, and on a grid.
+        value: ``angle_wrap``; a continuous one returns the kernel as it is, and so does a grid.
     """
     if isinstance(value, Grid) or value.angle_wrap == "continuous":
         return kernel
     angles = data.points[:, list(task.periodic)]
     low, high = angles.min(axis=0), angles.max(axis=0)
     wraps_at = 0.5 * (low + high) - np.pi
-    within_a_turn = high - low <= 2.0 * np.pi
-    lengthscales = np.where(within_a_turn, WRAP_LENGTHSCALE, UNWRAPPED_LENGTHSCALE)
+    wrapped = high - low <= 2.0 * np.pi
+    lengthscales = np.where(wrapped, WRAP_LENGTHSCALE, UNWRAPPED_LENGTHSCALE)
     factors = wrap_factors(task.periodic, wraps_at)
     return Kernel((*kernel.factors, *factors), np.append(kernel.lengthscales, lengthscales))
 
 
 def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
-    """Observed ``phi(s'_i)``, (n, r) or (n,); after a real end the start states are the successor.
+    """Features ``phi(s'_i)`` of successors, (n, r) or (n,); a termination leads to a start state.
 
     Args:
         data: n transitions.
@@ -69,16 +93,16 @@ def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
 
 
 def restart_features(starts: FloatArray, states: FloatArray, exploring_starts: float) -> FloatArray:
-    """Mean features (r,) of the states that the process restarts in, as the update plans.
+    """Mean features (r,) of the states in which the process restarts, as assumed by the update.
 
     A restart with probability p acts as a discount 1 - p.  Under a discount one policy is optimal
     from every state, so other restart states leave it optimal.  But the dual hardly determines V
-    where its weights vanish, and noise leads there; exploring starts spread the weights.
+    where its weights vanish, and noise can lead there; exploring starts spread the weights.
 
     Args:
-        starts, states: (r,) means over the start states and over the sampled states (in low rank:
-            over those in memory).
-        exploring_starts: share of the latter.
+        starts: (r,) mean over the start states.
+        states: (r,) mean over the sampled states (in low rank: over those in memory).
+        exploring_starts: share of restarts in sampled states.
     """
     return (1.0 - exploring_starts) * starts + exploring_starts * states
 
@@ -88,11 +112,12 @@ def feature_differences(
 ) -> FloatArray:
     """``B = (1 - p) E[phi(s') | s_i, a_i] + p phi_restart - phi(s_i)``, (n, r).
 
-    The process restarts with the known probability p, so that part of the dynamics needs no model.
+    The restart probability p is known, so that this part of the dynamics needs no model.
 
     Args:
-        own, expected: (n, r) features of each state, and what they are expected to become.
-        restart: (r,) of `restart_features`.
+        own: (n, r) features of each state.
+        expected: (n, r) expected features of its successor.
+        restart: (r,) mean features after a restart (`restart_features`).
         restart_probability: p.
     """
     return (1.0 - restart_probability) * expected + restart_probability * restart - own
@@ -103,6 +128,63 @@ def state_actions(data: Transitions, task: TaskSpec) -> FloatArray:
     return np.concatenate([data.states, task.scaled_applied(data.actions)], axis=1)
 
 
+@dataclass(frozen=True)
+class HyperparameterFit:
+    """The problem whose solution are the hyper-parameters of a regression on states and actions.
+
+    The parameters are g + da log lengthscales, then log lambda.
+
+    Attributes:
+        kernel: over states and actions, at median lengthscales.
+        loss: leave-one-out error on a subsample.
+        prior: over the parameters.
+        starts: at which the loss is evaluated; the search begins at the best of them.
+    """
+
+    kernel: Kernel
+    loss: EmbeddingLoss
+    prior: Prior
+    starts: tuple[FloatArray, ...]
+
+    @classmethod
+    def from_samples(
+        cls,
+        inputs: FloatArray,
+        targets: FloatArray,
+        state_kernel: Kernel,
+        task: TaskSpec,
+        start: FloatArray | None,
+        rng: np.random.Generator,
+    ) -> HyperparameterFit:
+        """The problem for n samples; arguments as of `embedding_hyperparameters`."""
+        action_factors = tuple(
+            SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
+        )
+        factors = (*state_kernel.factors, *action_factors)
+        squares = np.sum((targets - targets.mean(axis=0)) ** 2, axis=1)
+        rows, weights = pps_subsample(squares, rng)
+        action_lengthscales = median_lengthscales(action_factors, inputs, rng)
+        median = np.log(np.append(state_kernel.lengthscales, action_lengthscales))
+        prior = Prior(
+            centre=np.append(median, np.log(REGULARISER)),
+            std=np.append(np.full(len(factors), LOG_LENGTHSCALE_STD), LOG_REGULARISER_STD),
+            low=np.append(median - LOG_LENGTHSCALE_RANGE, np.log(REGULARISER_RANGE[0])),
+            high=np.append(median + LOG_LENGTHSCALE_RANGE, np.log(REGULARISER_RANGE[1])),
+            # the loss is 2 / n times the negative log likelihood of Gaussian errors of fitted
+            # variance, up to a constant
+            strength=2.0 / effective_target_count(squares[rows], weights),
+        )
+        distances = factor_distances(factors, inputs[rows])
+        loss = EmbeddingLoss(distances, targets[rows], weights / weights.mean())
+        noisy = np.append(median, np.log(REGULARISER_OF_NOISY_DATA))
+        starts = (prior.centre, noisy) if start is None else (start, prior.centre, noisy)
+        return cls(Kernel(factors, np.exp(median)), loss, prior, starts)
+
+    def solve(self) -> FloatArray:
+        """Log hyper-parameters (g + da + 1,) with the smallest loss plus prior."""
+        return minimise(self.loss, self.prior, *self.starts)
+
+
 def embedding_hyperparameters(
     inputs: FloatArray,
     targets: FloatArray,
@@ -111,42 +193,20 @@ def embedding_hyperparameters(
     start: FloatArray | None,
     rng: np.random.Generator,
 ) -> tuple[Kernel, float, FloatArray]:
-    """Kernel and regulariser of the embedding by leave-one-out error (Eq. 4), and their logs.
-
-    And of any other regression on states and applied actions: it is the same.
+    """Kernel and regulariser of a regression, by leave-one-out error (Eq. 4), and their logs.
 
     Args:
         inputs: (n, ds + da) states and applied actions.
-        targets: (n, r) what is to be predicted, such as features of the observed successors.
-        state_kernel: its factors are those of the embedding's kernel, with other lengthscales, of
-            which these are the typical ones.
+        targets: (n, r) such as features of the observed successors.
+        state_kernel: over states, with g factors.  The kernel of the regression has these factors,
+            one per action coordinate, and other lengthscales; these are the prior mean.
         task: number of action coordinates.
-        start: log hyper-parameters (g + da + 1,) where the last fit ended, if there was one.
-        rng: chooses the samples of the fit.
+        start: log hyper-parameters (g + da + 1,) of the last fit, if there was one.
+        rng: draws the samples of the fit.
     """
-    action_factors = tuple(
-        SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
-    )
-    factors = (*state_kernel.factors, *action_factors)
-    squares = np.sum((targets - targets.mean(axis=0)) ** 2, axis=1)
-    sample, weights = pps_subsample(squares, rng)
-    for_actions = median_lengthscales(action_factors, inputs, rng)
-    typical = np.log(np.append(state_kernel.lengthscales, for_actions))
-    prior = Prior(
-        centre=np.append(typical, np.log(1e-3)),
-        std=np.append(np.ones(len(factors)), 3.0),
-        low=np.append(typical - 3.0, np.log(1e-6)),
-        high=np.append(typical + 3.0, 0.0),
-        # the loss is twice minus the log density of one Gaussian error whose variance is fitted
-        strength=2.0 / effective_target_count(squares[sample], weights),
-    )
-    loss = EmbeddingLoss(
-        factor_distances(factors, inputs[sample]), targets[sample], weights / weights.mean()
-    )
-    noisy = np.append(typical, np.log(0.1))
-    starts = (prior.centre, noisy) if start is None else (start, prior.centre, noisy)
-    x = minimise(loss, prior, *starts)
-    return Kernel(factors, np.exp(x[:-1])), float(np.exp(x[-1])), x
+    fit = HyperparameterFit.from_samples(inputs, targets, state_kernel, task, start, rng)
+    x = fit.solve()
+    return fit.kernel.with_lengthscales(np.exp(x[:-1])), float(np.exp(x[-1])), x
 
 
 def fit_embedding(
@@ -157,10 +217,15 @@ def fit_embedding(
     start: FloatArray | None,
     rng: np.random.Generator,
 ) -> tuple[KernelEmbedding, FloatArray]:
-    """The embedding (Eq. 4) of n transitions on states and applied actions, and its log parameters.
+    """The embedding (Eq. 4) of n transitions and its log hyper-parameters, at a cost of n^3.
 
-    Arguments are those of `embedding_hyperparameters`, with (n, r) ``targets``: features of
-    successors, or anything else that is to be regressed.
+    Args:
+        data: n transitions.
+        targets: (n, r) such as features of the observed successors.
+        state_kernel, task, start, rng: as of `embedding_hyperparameters`.
+
+    Raises:
+        NumericalError: the Gram matrix cannot be factorised.
     """
     inputs = state_actions(data, task)
     kernel, regulariser, x = embedding_hyperparameters(
@@ -177,10 +242,10 @@ def fit_regression(
     start: FloatArray | None,
     rng: np.random.Generator,
 ) -> tuple[KernelEmbedding | PivotedEmbedding, FloatArray]:
-    """The same where only predictions are asked for: in few features, where these are enough."""
+    """`fit_embedding` in few pivots where these suffice, for predictions rather than strengths."""
     inputs = state_actions(data, task)
     kernel, regulariser, x = embedding_hyperparameters(
         inputs, targets, state_kernel, task, start, rng
     )
-    few = PivotedEmbedding.fit(kernel, inputs, regulariser)
-    return few or KernelEmbedding.fit(kernel, inputs, regulariser), x
+    pivoted = PivotedEmbedding.fit(kernel, inputs, regulariser)
+    return pivoted or KernelEmbedding.fit(kernel, inputs, regulariser), x
