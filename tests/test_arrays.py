@@ -86,14 +86,14 @@ def test_the_strict_library_does_not_mix_arrays() -> None:
         np.asarray(strict(np.ones(2)))
 
 
-def test_numpy_arrays_are_passed_through_as_they_are() -> None:
+def test_numpy_arrays_are_not_copied() -> None:
     a = normal(3, 2)
     assert as_float(a) is a and as_numpy(a) is a and like(a, a) is a
     assert namespace(a) is np
     assert as_float([1, 2]).dtype == np.float64
 
 
-def test_arrays_go_to_a_device_and_come_back() -> None:
+def test_arrays_are_copied_to_a_device_and_back() -> None:
     a = normal(4, 3)
     there = like(a, strict(np.zeros(1)))
     assert is_strict(there)
@@ -103,7 +103,7 @@ def test_arrays_go_to_a_device_and_come_back() -> None:
     np.testing.assert_array_equal(back, a)
 
 
-def test_rows_and_columns_are_taken_in_any_order_and_twice() -> None:
+def test_rows_and_columns_can_be_taken_in_any_order_and_repeatedly() -> None:
     a = normal(4, 3)
     chosen = np.array([2, 0, 0, 3])
     assert_agree(rows(strict(a), chosen), a[chosen])
@@ -196,7 +196,7 @@ def test_embeddings_agree(regulariser: float) -> None:
     x, queries, successors = normal(30, 2), normal(5, 2, seed=1), normal(30, 4, seed=2)
     here = KernelEmbedding.fit(KERNEL, x, regulariser)
     there = KernelEmbedding.fit(KERNEL, strict(x), regulariser)
-    # The condition of K + lambda I, below 1e3, takes its digits.
+    # K + lambda I has a condition number of up to 1e3, which costs three digits.
     found = there.expected_features(strict(successors))
     assert_agree(found, here.expected_features(successors), 1e-10)
     for q in (queries, queries[:1]):
@@ -304,7 +304,7 @@ def assert_same_update(
     wanted: tuple[kreps.KREPS, UpdateInfo],
     states: FloatArray,
 ) -> None:
-    """Weights and V to rounding; the policy as far as the choice of its pivots permits."""
+    """Weights and V agree to rounding, the policy as far as the choice of its pivots permits."""
     # Measured: up to 4e-7 (of the smallest weights) and 2e-8, as bases of 60 to 300 features are
     # ill-conditioned.
     weights, wanted_weights = found[1].dual.weights, wanted[1].dual.weights

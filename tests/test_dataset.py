@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +11,8 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.data import dataset as dataset_module
-from kreps.data.dataset import CHUNK, Dataset
-from kreps.data.rollouts import Rollout, Transitions
+from kreps.data.dataset import ArrayChunk, Dataset
+from kreps.data.rollouts import Rollout, Rollouts, Transitions
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, DataError, StorageError
 from kreps.kernels.arrays import FloatArray
@@ -50,12 +48,16 @@ def arrays(rollouts: list[Rollout]) -> dict[str, Any]:
     }
 
 
-def from_memory(_: Path) -> Dataset:
-    return Dataset.from_rollouts(ROLLOUTS)
+SHORT = 6
+"""Samples per chunk, about, which makes three chunks: 4 + 1 + 7, 2 + 2 + 9 and 1 + 5."""
 
 
-def from_arrays(_: Path) -> Dataset:
-    return Dataset.from_arrays(**arrays(ROLLOUTS))
+def from_memory(_: Path, chunk_size: int = SHORT) -> Dataset:
+    return Dataset.from_rollouts(ROLLOUTS, chunk_size=chunk_size)
+
+
+def from_arrays(_: Path, chunk_size: int = SHORT) -> Dataset:
+    return Dataset.from_arrays(**arrays(ROLLOUTS), chunk_size=chunk_size)
 
 
 def from_disk(folder: Path) -> Dataset:
@@ -64,11 +66,11 @@ def from_disk(folder: Path) -> Dataset:
     for name in ("observations", "actions", "rewards"):
         np.save(folder / f"{name}.npy", given[name])
         given[name] = np.load(folder / f"{name}.npy", mmap_mode="r")
-    return Dataset.from_arrays(**given)
+    return Dataset.from_arrays(**given, chunk_size=SHORT)
 
 
 def from_files(folder: Path) -> Dataset:
-    """Three files; their names decide the order, not when they were written."""
+    """Three files, ordered by their names and not by when they were written."""
     for name, part in [("2", ROLLOUTS[6:]), ("0", ROLLOUTS[:3]), ("1", ROLLOUTS[3:6])]:
         kreps.save_rollouts(part, folder / f"part{name}.safetensors")
     return kreps.rollout_folder(folder)
@@ -76,12 +78,6 @@ def from_files(folder: Path) -> Dataset:
 
 FORMS = [from_memory, from_arrays, from_disk, from_files]
 Form = Callable[[Path], Dataset]
-
-
-@pytest.fixture
-def short_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of six samples or so: 4+1+7 | 2+2+9 | 1+5."""
-    monkeypatch.setattr(dataset_module, "CHUNK", 6)
 
 
 def assert_same(found: Transitions, wanted: Transitions) -> None:
@@ -93,45 +89,67 @@ def assert_same(found: Transitions, wanted: Transitions) -> None:
 
 
 @pytest.mark.parametrize("form", FORMS)
-@pytest.mark.usefixtures("short_chunks")
 def test_every_form_holds_the_same_transitions(form: Form, tmp_path: Path) -> None:
     found = form(tmp_path)
     assert len(found.chunks) == 3
     assert len(found) == sum(LENGTHS) == 31
-    parts = [chunk.load() for chunk in found.chunks]
-    assert [len(part) for part in parts] == [len(chunk) for chunk in found.chunks]
+    parts = [chunk.load().transitions for chunk in found.chunks]
+    assert [len(part) for part in parts] == [chunk.steps for chunk in found.chunks] == [12, 13, 6]
     assert_same(Transitions.concat(parts), Transitions.from_rollouts(ROLLOUTS))
 
 
 @pytest.mark.parametrize("form", [from_memory, from_arrays])
-@pytest.mark.parametrize("size", [1, 3, 6, 10, 31, 1000])
-def test_chunks_are_whole_rollouts_of_about_the_size_asked_for(
-    form: Form, size: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(
+    ("size", "steps"),
+    [
+        (1, LENGTHS),
+        (3, [4, 8, 4, 9, 6]),
+        (6, [12, 13, 6]),
+        (10, [12, 13, 6]),
+        (12, [12, 13, 6]),
+        (13, [14, 17]),
+        (31, [31]),
+        (1000, [31]),
+    ],
+)
+def test_a_chunk_ends_with_the_rollout_that_fills_its_size(
+    form: Any, size: int, steps: list[int], tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(dataset_module, "CHUNK", size)
-    chunks = form(tmp_path).chunks
-    assert sum(map(len, chunks)) == 31
-    assert {sum(len(chunk) for chunk in chunks[:i]) for i in range(len(chunks))} <= set(
-        np.cumsum([0, *LENGTHS]).tolist()
-    )
-    assert max(map(len, chunks)) < size + max(LENGTHS)
-    # No two neighbours would have made one chunk.
-    assert all(len(a) + len(b) > size for a, b in pairwise(chunks))
+    assert [chunk.steps for chunk in form(tmp_path, size).chunks] == steps
 
 
-def test_without_being_asked_a_small_set_is_one_chunk() -> None:
-    assert CHUNK > 31
+def test_a_small_set_is_one_chunk_by_default() -> None:
     assert len(Dataset.from_rollouts(ROLLOUTS).chunks) == 1
+    assert len(Dataset.from_arrays(**arrays(ROLLOUTS)).chunks) == 1
+
+
+def test_a_chunk_has_8192_samples_or_more_by_default() -> None:
+    many = [rollout(2048, seed=i) for i in range(9)]
+    assert [chunk.steps for chunk in Dataset.from_rollouts(many).chunks] == [8192, 8192, 2048]
+
+
+@pytest.mark.parametrize("size", [0, -1])
+def test_a_chunk_size_below_one_raises(size: int) -> None:
+    with pytest.raises(ConfigurationError, match="chunk_size"):
+        Dataset.from_rollouts(ROLLOUTS, chunk_size=size)
+
+
+def test_chunks_in_memory_are_slices_of_one_container() -> None:
+    flat = Rollouts.from_list(ROLLOUTS)
+    for chunk in Dataset.from_rollouts(flat, chunk_size=SHORT).chunks:
+        assert isinstance(chunk, Rollouts)
+        assert np.shares_memory(chunk.points, flat.points)
 
 
 def test_rollouts_may_come_from_a_generator() -> None:
     found = Dataset.from_rollouts(rollout(3, seed=i) for i in range(4))
     assert_same(
-        found.chunks[0].load(), Transitions.from_rollouts([rollout(3, seed=i) for i in range(4)])
+        found.chunks[0].load().transitions,
+        Transitions.from_rollouts([rollout(3, seed=i) for i in range(4)]),
     )
 
 
-def test_nothing_ends_where_nothing_is_said_to_end() -> None:
+def test_without_flags_no_rollout_is_terminated() -> None:
     given = arrays(ROLLOUTS) | {"terminated": None}
     assert not Dataset.from_arrays(**given).chunks[0].load().terminated.any()
 
@@ -147,28 +165,31 @@ def test_arrays_of_other_number_types_become_floats() -> None:
     np.testing.assert_array_equal(found.actions, given["actions"])
 
 
-def test_arrays_on_disk_are_neither_read_before_they_are_needed_nor_written(tmp_path: Path) -> None:
+def test_memory_maps_are_read_by_load_only_and_not_written(tmp_path: Path) -> None:
     found = from_disk(tmp_path)
-    assert isinstance(found.chunks[0].observations, np.memmap)  # type: ignore[attr-defined]
-    data = found.chunks[0].load()
+    chunk = found.chunks[0]
+    assert isinstance(chunk, ArrayChunk)
+    assert isinstance(chunk.unread.points, np.memmap)
+    data = chunk.load()
     assert not isinstance(data.points, np.memmap)
-    data.points[:] = 0.0
-    assert_same(found.chunks[0].load(), Transitions.from_rollouts(ROLLOUTS))
+    with pytest.raises(ValueError, match="read-only"):
+        data.points[:] = 0.0
+    assert_same(chunk.load().transitions, Transitions.from_rollouts(ROLLOUTS[:3]))
 
 
-def test_values_are_split_as_the_samples_are(short_chunks: None) -> None:
-    found = Dataset.from_rollouts(ROLLOUTS)
+def test_values_are_split_as_the_samples_are() -> None:
+    found = Dataset.from_rollouts(ROLLOUTS, chunk_size=SHORT)
     np.testing.assert_array_equal(found.offsets, [0, 12, 25, 31])
     parts = found.split(np.arange(31.0))
-    assert [len(part) for part in parts] == [len(chunk) for chunk in found.chunks]
+    assert [len(part) for part in parts] == [12, 13, 6]
     np.testing.assert_array_equal(np.concatenate(parts), np.arange(31.0))
 
 
-# ---- some of the samples ----------------------------------------------------------------------
+# ---- subsets of the samples --------------------------------------------------------------------
 
 
 def rollouts_of(rows: list[int]) -> list[int]:
-    """The roll-outs that samples are of."""
+    """Numbers of the rollouts that contain these samples."""
     return sorted({int(np.searchsorted(np.cumsum(LENGTHS), row, side="right")) for row in rows})
 
 
@@ -178,10 +199,7 @@ def rollouts_of(rows: list[int]) -> list[int]:
     [[0], [11, 12], [4, 13, 30], [12], [30], [0, 4, 11, 12, 14, 15, 24, 25, 30], [*range(31)]],
     ids=str,
 )
-@pytest.mark.usefixtures("short_chunks")
-def test_some_samples_are_taken_from_wherever_they_are(
-    rows: list[int], form: Form, tmp_path: Path
-) -> None:
+def test_samples_are_taken_from_their_chunks(rows: list[int], form: Form, tmp_path: Path) -> None:
     found = form(tmp_path).take(np.array(rows))
     whole = Transitions.from_rollouts(ROLLOUTS)
     np.testing.assert_array_equal(found.states, whole.states[rows])
@@ -195,9 +213,10 @@ def test_some_samples_are_taken_from_wherever_they_are(
     np.testing.assert_array_equal(found.points[found.start], starts)
 
 
-def test_all_samples_are_the_transitions_themselves(short_chunks: None) -> None:
+def test_all_samples_are_taken_unchanged() -> None:
     assert_same(
-        Dataset.from_rollouts(ROLLOUTS).take(np.arange(31)), Transitions.from_rollouts(ROLLOUTS)
+        Dataset.from_rollouts(ROLLOUTS, chunk_size=SHORT).take(np.arange(31)),
+        Transitions.from_rollouts(ROLLOUTS),
     )
 
 
@@ -215,7 +234,7 @@ def test_rollouts_come_back_from_a_file_exactly(tmp_path: Path) -> None:
         assert mine.terminated is theirs.terminated
 
 
-def test_no_rollout_and_mixed_widths_are_not_written(tmp_path: Path) -> None:
+def test_no_rollout_or_mixed_widths_are_not_written(tmp_path: Path) -> None:
     for rollouts in ([], [rollout(3), rollout(3, ds=2)], [rollout(3), rollout(3, da=1)]):
         with pytest.raises(DataError):
             kreps.save_rollouts(rollouts, tmp_path / "a.safetensors")
@@ -223,7 +242,7 @@ def test_no_rollout_and_mixed_widths_are_not_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("now", [ROLLOUTS[:2], ROLLOUTS])
-def test_a_file_that_has_changed_since_the_folder_was_opened_is_refused(
+def test_a_file_that_has_changed_since_the_folder_was_opened_raises(
     now: list[Rollout], tmp_path: Path
 ) -> None:
     path = tmp_path / "a.safetensors"
@@ -240,7 +259,8 @@ def test_a_file_that_has_changed_since_the_folder_was_opened_is_refused(
 def test_a_folder_is_opened_without_reading_its_arrays(tmp_path: Path) -> None:
     kreps.save_rollouts(ROLLOUTS, tmp_path / "a.safetensors")
     content = bytearray((tmp_path / "a.safetensors").read_bytes())
-    content[-8:] = np.array(np.nan).tobytes()
+    begin = 8 + int.from_bytes(content[:8], "little")  # of the arrays, after the header
+    content[begin:] = b"\xff" * (len(content) - begin)  # NaN in every number
     (tmp_path / "a.safetensors").write_bytes(content)
     found = kreps.rollout_folder(tmp_path)
     assert len(found) == 31
@@ -249,9 +269,7 @@ def test_a_folder_is_opened_without_reading_its_arrays(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"not this", "policy"])
-def test_a_foreign_file_in_the_folder_is_refused_at_once(
-    content: bytes | str, tmp_path: Path
-) -> None:
+def test_a_foreign_file_in_the_folder_raises_at_once(content: bytes | str, tmp_path: Path) -> None:
     kreps.save_rollouts(ROLLOUTS, tmp_path / "a.safetensors")
     if isinstance(content, bytes):
         (tmp_path / "b.safetensors").write_bytes(content)
@@ -263,23 +281,23 @@ def test_a_foreign_file_in_the_folder_is_refused_at_once(
         kreps.rollout_folder(tmp_path)
 
 
-def test_other_files_in_the_folder_are_left_alone(tmp_path: Path) -> None:
+def test_files_with_other_extensions_are_ignored(tmp_path: Path) -> None:
     kreps.save_rollouts(ROLLOUTS, tmp_path / "a.safetensors")
     (tmp_path / "notes.txt").write_text("of the experiment")
     assert len(kreps.rollout_folder(tmp_path)) == 31
 
 
-def test_a_folder_without_rollouts_and_none_at_all_are_refused(tmp_path: Path) -> None:
+def test_a_folder_without_rollouts_or_no_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for path in (tmp_path, tmp_path / "file", tmp_path / "missing"):
         with pytest.raises(StorageError):
             kreps.rollout_folder(path)
 
 
-# ---- what is refused --------------------------------------------------------------------------
+# ---- invalid data -----------------------------------------------------------------------------
 
 
-def test_nothing_is_refused() -> None:
+def test_no_rollout_at_all_raises() -> None:
     with pytest.raises(DataError, match="at least one"):
         Dataset.from_rollouts([])
     with pytest.raises(DataError, match="at least one"):
@@ -294,6 +312,8 @@ def test_nothing_is_refused() -> None:
         {"lengths": [*LENGTHS, 0]},
         {"lengths": [*LENGTHS[:-2], 7, -1]},
         {"lengths": [*LENGTHS[:-1], 5.5]},
+        {"lengths": [*LENGTHS[:-1], np.nan]},
+        {"lengths": [*LENGTHS[:-1], 1e18]},
         {"lengths": np.array([LENGTHS])},
         {"terminated": [False] * 7},
         {"observations": np.zeros((38, 3))},
@@ -306,14 +326,14 @@ def test_nothing_is_refused() -> None:
     ],
     ids=lambda changes: "-".join(changes),
 )
-def test_sizes_that_do_not_fit_together_are_refused(changes: dict[str, Any]) -> None:
+def test_sizes_that_do_not_fit_together_raise(changes: dict[str, Any]) -> None:
     assert len(Dataset.from_arrays(**arrays(ROLLOUTS))) == 31
     with pytest.raises(DataError, match="do not fit together"):
         Dataset.from_arrays(**(arrays(ROLLOUTS) | changes))
 
 
 def rejected(found: Dataset, reason: str) -> None:
-    """By a learner, which stays as it was."""
+    """A learner raises `DataError` and is left unchanged."""
     learner = kreps.KREPS(TASK)
     with pytest.raises(DataError, match=reason):
         learner.update(found)
@@ -323,7 +343,7 @@ def rejected(found: Dataset, reason: str) -> None:
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, 1e200])
 @pytest.mark.parametrize("name", ["observations", "actions", "rewards"])
-def test_numbers_that_are_no_data_are_refused_by_name(name: str, bad: float) -> None:
+def test_invalid_numbers_raise_and_are_named(name: str, bad: float) -> None:
     given = arrays(ROLLOUTS)
     given[name][-1] = bad
     rejected(Dataset.from_arrays(**given), name)
@@ -331,7 +351,7 @@ def test_numbers_that_are_no_data_are_refused_by_name(name: str, bad: float) -> 
 
 @pytest.mark.parametrize(("ds", "da"), [(2, 2), (4, 2), (3, 1), (3, 3)])
 @pytest.mark.parametrize("form", ["memory", "arrays", "files"])
-def test_a_set_of_another_width_than_the_task_is_refused(
+def test_a_set_of_other_widths_than_the_task_raises(
     form: str, ds: int, da: int, tmp_path: Path
 ) -> None:
     strangers = [rollout(5, seed=i, ds=ds, da=da) for i in range(3)]
@@ -347,26 +367,26 @@ def test_a_set_of_another_width_than_the_task_is_refused(
 
 
 @pytest.mark.parametrize(("ds", "da"), [(2, 2), (3, 1)])
-def test_rollouts_of_different_widths_are_refused(ds: int, da: int) -> None:
+def test_rollouts_of_different_widths_raise(ds: int, da: int) -> None:
     with pytest.raises(DataError):
         Dataset.from_rollouts([*ROLLOUTS, rollout(4, ds=ds, da=da)])
 
 
-def test_what_is_no_rollout_is_refused_by_its_place() -> None:
+def test_an_item_that_is_no_rollout_is_named_by_its_number() -> None:
     with pytest.raises(DataError, match="item 1 is a str"):
         Dataset.from_rollouts([ROLLOUTS[0], "rollout"])  # type: ignore[list-item]
 
 
-def test_an_exact_update_from_a_set_is_refused_with_the_remedy() -> None:
-    learner = kreps.KREPS(TASK, approximation="exact")
-    with pytest.raises(ConfigurationError, match="pivoted"):
+def test_an_exact_update_from_a_set_raises_with_the_remedy() -> None:
+    learner = kreps.KREPS(TASK, low_rank=None)
+    with pytest.raises(ConfigurationError, match=r"low_rank=kreps\.LowRank\(\)"):
         learner.update(Dataset.from_rollouts(ROLLOUTS))
     assert learner.state.iteration == 0
 
 
-def test_methods_that_need_all_samples_at_once_refuse_a_set() -> None:
+def test_methods_that_need_all_samples_in_memory_do_not_take_a_set() -> None:
     for learner in (kreps.ValueIteration(TASK), kreps.NPALP(TASK)):
-        with pytest.raises(DataError):
+        with pytest.raises(DataError, match="use KREPS for data sets"):
             learner.update(Dataset.from_rollouts(ROLLOUTS))  # type: ignore[arg-type]
 
 

@@ -1,4 +1,4 @@
-"""The swing-up in both forms, its physics and reference values, and restarts of any environment."""
+"""The swing-up: environment, batch model, physics, reference rewards; random restarts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ HANGING = (np.array([np.pi]), np.array([0.0]))
 
 @dataclass(frozen=True)
 class Constant:
-    """The same torque whatever the state."""
+    """The same torque in every state."""
 
     torque: float
 
@@ -40,7 +40,7 @@ class Constant:
 
 @dataclass(frozen=True)
 class Uniform:
-    """Any torque within the limits, from a generator of its own."""
+    """Uniformly random torque within the limits."""
 
     rng: np.random.Generator
 
@@ -49,7 +49,7 @@ class Uniform:
 
 
 def energy(theta: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Kinetic and potential energy of the rod in J, zero at rest in the horizontal."""
+    """Kinetic and potential energy (m,) of the rod in J, zero at rest in the horizontal."""
     return 0.5 * swing_up.INERTIA * velocity**2 + swing_up.WEIGHT_TORQUE * np.cos(theta)
 
 
@@ -60,7 +60,7 @@ def average_reward(policy: StochasticPolicy, episodes: int = 200) -> float:
 
 
 def lengths_of(env: gym.Env[Any, Any], action: Any, seeds: Sequence[int | None]) -> list[int]:
-    """Steps of one episode per seed, with restarts as the only reason to end."""
+    """Steps of one episode per seed, which must end with a restart."""
     lengths = []
     for seed in seeds:
         env.reset(seed=seed)
@@ -75,17 +75,17 @@ def lengths_of(env: gym.Env[Any, Any], action: Any, seeds: Sequence[int | None])
     return lengths
 
 
-# ---- the environment as Gymnasium sees it -----------------------------------------------------
+# ---- the Gymnasium interface ----------------------------------------------------------------
 
 
-def test_gymnasium_checker_finds_nothing_of_substance() -> None:
-    matters_of_taste = ("symmetric and normalized space", "value is -infinity", "value is infinity")
+def test_gymnasium_checker_has_no_substantial_warning() -> None:
+    recommendations = ("symmetric and normalized space", "value is -infinity", "value is infinity")
     env = gym.make(NAME, render_mode="rgb_array")
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         check_env(env.unwrapped, skip_render_check=False)
     others = [
-        str(w.message) for w in caught if not any(t in str(w.message) for t in matters_of_taste)
+        str(w.message) for w in caught if not any(t in str(w.message) for t in recommendations)
     ]
     assert others == []
 
@@ -101,7 +101,7 @@ def test_reset_starts_hanging_at_rest_and_step_returns_python_types() -> None:
     assert terminated is False and truncated is False
 
 
-def test_observations_handed_out_are_not_overwritten_by_later_steps() -> None:
+def test_returned_observations_are_not_overwritten_by_later_steps() -> None:
     env = SwingUp()
     first, _ = env.reset(seed=0)
     second = env.step(np.array([10.0]))[0]
@@ -109,11 +109,11 @@ def test_observations_handed_out_are_not_overwritten_by_later_steps() -> None:
     env.step(np.array([-10.0]))
     np.testing.assert_array_equal(first, [np.pi, 0.0])
     np.testing.assert_array_equal(second, kept)
-    second[:] = 99.0  # nor does the environment take back what it handed out
+    second[:] = 99.0  # nor does overwriting them change the state of the environment
     assert np.abs(env.step(np.array([0.0]))[0]).max() < 20.0
 
 
-def test_metadata_names_the_angle_and_labels_every_coordinate() -> None:
+def test_metadata_marks_the_angle_and_labels_every_coordinate() -> None:
     env = gym.make(NAME)
     assert env.metadata["periodic_coordinates"] == (0,)
     assert len(env.metadata["observation_labels"]) == 2
@@ -121,7 +121,7 @@ def test_metadata_names_the_angle_and_labels_every_coordinate() -> None:
     assert env.metadata["render_fps"] == 20
 
 
-def test_rendering_is_a_picture_that_follows_the_state() -> None:
+def test_the_rendered_picture_depends_on_the_state() -> None:
     env = gym.make(NAME, render_mode="rgb_array")
     env.reset(seed=0)
     before = np.asarray(env.render())
@@ -150,7 +150,7 @@ def test_the_picture_shows_upright_above_and_a_positive_angle_on_the_left() -> N
     assert SwingUp().render() is None
 
 
-# ---- both forms -------------------------------------------------------------------------------
+# ---- the batch model --------------------------------------------------------------------------
 
 
 def test_batch_and_environment_give_the_same_trajectories_from_the_same_seeds() -> None:
@@ -171,7 +171,7 @@ def test_batch_and_environment_give_the_same_trajectories_from_the_same_seeds() 
             assert reward == rewards[j]
 
 
-def test_a_batch_row_does_not_depend_on_the_rows_beside_it() -> None:
+def test_a_row_of_a_batch_does_not_depend_on_other_rows() -> None:
     model = SwingUpBatch()
     states = np.array([[np.pi, 0.0], [0.1, 2.0], [4.0, -3.0]])
     actions = np.array([[5.0], [-30.0], [100.0]])
@@ -188,19 +188,16 @@ def test_a_batch_row_does_not_depend_on_the_rows_beside_it() -> None:
 # ---- physics ----------------------------------------------------------------------------------
 
 
-def test_energy_is_conserved_without_friction_noise_and_torque(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(swing_up, "FRICTION", 0.0)
+def test_energy_is_conserved_without_friction_noise_and_torque() -> None:
     theta, velocity = np.array([np.pi - 2.0, 0.3, 1.5]), np.array([0.0, 0.5, 9.0])
     start = energy(theta, velocity)
     for _ in range(200):  # ten seconds
-        theta, velocity = swing_up.integrate(theta, velocity, np.zeros(3))
+        theta, velocity = swing_up.integrate(theta, velocity, np.zeros(3), friction=0.0)
     drift = np.abs(energy(theta, velocity) - start)
     assert drift.max() < 1e-3  # of about 50 J; Euler steps would lose all of it
 
 
-def test_friction_only_takes_energy_away() -> None:
+def test_friction_lowers_the_energy_at_every_step() -> None:
     theta, velocity = np.array([0.5]), np.array([4.0])
     left = [energy(theta, velocity)[0]]
     for _ in range(60):
@@ -209,12 +206,13 @@ def test_friction_only_takes_energy_away() -> None:
     assert (np.diff(left) < 0).all()
 
 
-def test_the_integrator_has_order_four(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_integrator_has_order_four() -> None:
     def after_one_second(sub_steps: int) -> FloatArray:
-        monkeypatch.setattr(swing_up, "SUB_STEPS", sub_steps)
         theta, velocity = np.array([2.0]), np.array([1.0])
         for _ in range(20):
-            theta, velocity = swing_up.integrate(theta, velocity, np.array([7.0]))
+            theta, velocity = swing_up.integrate(
+                theta, velocity, np.array([7.0]), sub_steps=sub_steps
+            )
         return np.concatenate([theta, velocity])
 
     exact = after_one_second(64)
@@ -244,12 +242,12 @@ def test_a_positive_torque_turns_counterclockwise_and_cannot_lift_the_pendulum_d
     for _ in range(400):
         theta, velocity = swing_up.integrate(theta, velocity, np.array([30.0]))
         highest = max(highest, float(theta[0]))
-    assert np.pi + 0.5 < highest < 1.5 * np.pi  # it rises, but stays below the horizontal
+    assert np.pi + 0.5 < highest < 1.5 * np.pi  # it rises, but not to the horizontal
     # at rest the torque balances the weight
     assert swing_up.WEIGHT_TORQUE * np.sin(theta[0] - np.pi) == pytest.approx(30.0, rel=0.05)
 
 
-def test_torque_beyond_the_limit_acts_and_costs_as_the_limit() -> None:
+def test_torque_beyond_the_limit_has_the_effect_and_cost_of_the_limit() -> None:
     model = SwingUpBatch()
     states = np.tile([2.0, -1.0], (2, 1))
     for beyond, limit in ((500.0, 30.0), (-500.0, -30.0)):
@@ -260,34 +258,25 @@ def test_torque_beyond_the_limit_acts_and_costs_as_the_limit() -> None:
         assert rewards[0] == pytest.approx(-10 * 2.0**2 - 0.1 - 0.001 * 30.0**2)
 
 
-def test_noise_has_variance_one_over_the_time_step_and_is_drawn_once_a_period(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    torques: list[FloatArray] = []
-
-    def record(
-        theta: FloatArray, velocity: FloatArray, torque: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
-        torques.append(torque)
-        return theta, velocity
-
-    monkeypatch.setattr(swing_up, "integrate", record)
-    rng, m = np.random.default_rng(0), 20_000
-    _, rewards, _ = SwingUpBatch().step(
-        np.tile([np.pi, 0.0], (m, 1)), np.full((m, 1), 40.0), [rng] * m
-    )
-    assert len(torques) == 1
-    noise = torques[0] - 30.0  # added after clipping, so that it can exceed the limit
-    assert noise.mean() == pytest.approx(0.0, abs=4 * np.sqrt(20.0 / m))
-    assert noise.var() == pytest.approx(20.0, abs=4 * 20.0 * np.sqrt(2.0 / m))
-    assert np.ptp(rewards) == 0.0  # the cost is of the command, not of the noise
+def test_noise_of_variance_20_is_added_to_the_clipped_torque_once_a_period() -> None:
+    m = 1000
+    start = np.tile([np.pi, 0.5], (m, 1))
+    rng, twin = np.random.default_rng(0), np.random.default_rng(0)
+    successors, rewards, _ = SwingUpBatch().step(start, np.full((m, 1), 40.0), [rng] * m)
+    # one number per rollout; the torque can exceed the limit of 30, as noise is added after it
+    torque = 30.0 + np.sqrt(20.0) * twin.standard_normal(m)
+    theta, velocity = swing_up.integrate(start[:, 0], start[:, 1], torque)
+    np.testing.assert_allclose(successors, np.stack([theta, velocity], axis=1), rtol=1e-12)
+    assert rng.standard_normal() == twin.standard_normal()
+    # the cost is that of the clipped command, without noise
+    np.testing.assert_allclose(rewards, -10.0 * np.pi**2 - 0.1 * 0.25 - 0.001 * 900.0, rtol=1e-12)
 
 
 def test_the_wrapped_angle_stays_inside_the_observation_space() -> None:
     space = SwingUp().observation_space
     assert isinstance(space, gym.spaces.Box)
-    cut = -0.5 * np.pi
-    angles = np.array([0.0, np.pi, -np.pi, cut, np.nextafter(cut, -9), 1.5 * np.pi, 7.0, 100.0])
+    wrap = -0.5 * np.pi
+    angles = np.array([0.0, np.pi, -np.pi, wrap, np.nextafter(wrap, -9), 1.5 * np.pi, 7.0, 100.0])
     wrapped = swing_up.wrap_angle(angles)
     assert (wrapped >= space.low[0]).all() and (wrapped <= space.high[0]).all()
     np.testing.assert_allclose(np.exp(1j * wrapped), np.exp(1j * angles), atol=1e-12)
@@ -298,7 +287,7 @@ def test_the_wrapped_angle_stays_inside_the_observation_space() -> None:
 def test_reference_value_of_constant_torque_is_a_local_optimum_on_one_side_only() -> None:
     reference = REFERENCE_REWARDS[NAME]["local optimum (constant torque)"]
     assert average_reward(Constant(-30.0)) == pytest.approx(reference, abs=0.7)
-    # the reward is 10 theta^2 with theta cut at 3 pi / 2: leaning to larger angles costs more
+    # the cost is 10 theta^2 with theta in [-pi / 2, 3 pi / 2), which is larger beyond pi than below
     assert average_reward(Constant(30.0)) < 2.0 * reference
 
 
@@ -328,33 +317,33 @@ def test_restarts_come_after_49_steps_on_average_in_any_environment(name: str) -
 
 
 @pytest.mark.parametrize("probability", [0.02, 0.2])
-def test_lengths_drawn_together_are_as_random_each_and_hardly_vary_in_sum(
+def test_stratified_lengths_have_the_right_distribution_and_a_sum_that_varies_little(
     probability: float,
 ) -> None:
-    together = np.array(
+    stratified = np.array(
         [stratified_lengths(np.random.default_rng(seed), probability, 30) for seed in range(2000)]
     )
     independent = np.array(
         [restart_length(np.random.default_rng([1, i]), probability) for i in range(20_000)]
     )
-    assert together.shape == (2000, 30) and together.min() >= 1
-    # each of them, the first as the last, has the distribution of an independent one
-    for column in (together[:, 0], together[:, 29]):
+    assert stratified.shape == (2000, 30) and stratified.min() >= 1
+    # each length has the distribution of an independent one
+    for column in (stratified[:, 0], stratified[:, 29]):
         for share in (0.1, 0.5, 0.9):
             limit = np.quantile(independent, share)
             standard_error = np.sqrt(share * (1.0 - share) / len(column))
             found, wanted = np.mean(column <= limit), np.mean(independent <= limit)
             assert found == pytest.approx(wanted, abs=4 * standard_error)
-    # their sum varies much less, and no order is left in which they were drawn
-    sums = together.sum(axis=1)
+    # their sum varies much less, and their order is random
+    sums = stratified.sum(axis=1)
     assert sums.mean() == pytest.approx(30 * independent.mean(), rel=0.03)
     assert sums.std() < 0.25 * np.sqrt(30) * independent.std()
-    assert abs(np.corrcoef(together[:, 0], together[:, 1])[0, 1]) < 0.1
+    assert abs(np.corrcoef(stratified[:, 0], stratified[:, 1])[0, 1]) < 0.1
 
 
 @pytest.mark.parametrize("probability", [1e-300, 1e-20, 1.0 - 1e-12])
 @pytest.mark.parametrize("count", [1, 30])
-def test_lengths_drawn_together_are_whole_numbers_whatever_the_probability(
+def test_stratified_lengths_are_whole_numbers_for_extreme_probabilities(
     probability: float, count: int
 ) -> None:
     lengths = stratified_lengths(np.random.default_rng(0), probability, count)
@@ -362,22 +351,29 @@ def test_lengths_drawn_together_are_whole_numbers_whatever_the_probability(
     assert min(lengths) >= (1 if probability > 0.5 else 10**15)
 
 
-def test_restarts_are_reproducible_by_seed_and_go_on_without_one() -> None:
+@pytest.mark.parametrize("count", [10, 30])
+def test_the_sum_of_stratified_lengths_has_a_standard_deviation_of_about_50(count: int) -> None:
+    sums = [sum(stratified_lengths(np.random.default_rng(i), 0.02, count)) for i in range(2000)]
+    assert np.mean(sums) == pytest.approx(49.0 * count, rel=0.02)
+    assert np.std(sums) == pytest.approx(50.0, rel=0.1)
+
+
+def test_restarts_are_reproducible_by_seed_and_continue_without_one() -> None:
     def lengths(first: int) -> list[int]:
         env = kreps.RandomRestart(SwingUp(), probability=0.1)
         return lengths_of(env, np.zeros(1), [first, None, None, None])
 
     assert lengths(5) == lengths(5)
     assert lengths(5) != lengths(6)
-    assert len(set(lengths(5))) > 1  # an unseeded reset draws anew, not the same length again
+    assert len(set(lengths(5))) > 1  # a reset without a seed draws the next length
 
 
-def test_an_unseeded_restart_wrapper_works() -> None:
+def test_a_restart_wrapper_needs_no_seed() -> None:
     env = kreps.RandomRestart(SwingUp(), probability=0.5)
     assert lengths_of(env, np.zeros(1), [None])[0] >= 1
 
 
-def test_a_restart_keeps_the_true_successor_and_does_not_touch_the_task() -> None:
+def test_a_restart_returns_the_successor_and_does_not_change_the_environment() -> None:
     env, plain = kreps.RandomRestart(SwingUp(), probability=0.2), SwingUp()
     np.testing.assert_array_equal(env.reset(seed=1)[0], plain.reset(seed=1)[0])
     truncated, steps = False, 0
@@ -390,25 +386,25 @@ def test_a_restart_keeps_the_true_successor_and_does_not_touch_the_task() -> Non
     assert steps > 1  # or this would compare a single step
 
 
-def test_a_real_end_is_not_relabelled_as_a_restart() -> None:
+def test_termination_takes_precedence_over_a_restart() -> None:
     class EndsAtOnce(SwingUp):
         def step(self, action: Any) -> Any:
             observation, reward, _, truncated, info = super().step(action)
             return observation, reward, True, truncated, info
 
-    env = kreps.RandomRestart(EndsAtOnce(), probability=0.999)  # due after one step
+    env = kreps.RandomRestart(EndsAtOnce(), probability=0.999)  # a restart after one step
     env.reset(seed=0)
     _, _, terminated, truncated, info = env.step(np.zeros(1))
     assert terminated and not truncated and "restart" not in info
 
 
 @pytest.mark.parametrize("probability", [0.0, 1.0, -0.1, 2.0, float("nan")])
-def test_an_impossible_restart_probability_is_refused(probability: float) -> None:
+def test_an_invalid_restart_probability_raises(probability: float) -> None:
     with pytest.raises(ConfigurationError, match="restart probability"):
         kreps.RandomRestart(SwingUp(), probability)
 
 
-def test_the_task_that_the_learner_sees_is_that_of_the_environment() -> None:
+def test_the_specification_of_the_task_is_that_of_the_environment() -> None:
     task = task_of(kreps.RandomRestart(gym.make(NAME)))
     assert isinstance(task, TaskSpec)
     assert task.observation_size == 2 and task.periodic == (0,)

@@ -1,4 +1,4 @@
-"""Exploration until the reward depends on the state, and which rollouts are remembered."""
+"""Exploration until the reward depends on the state, and which rollouts the window keeps."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.data.rewards import all_rollouts_informative, is_informative, reward_depends_on_state
-from kreps.data.rollouts import Rollout
+from kreps.data.rewards import is_informative, reward_depends_on_state
+from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
-from kreps.data.window import ReplayWindow, append, newest
+from kreps.data.window import ReplayWindow
 
 TASK = TaskSpec(2, np.array([-2.0, -1.0]), np.array([2.0, 1.0]))
 
@@ -26,6 +26,11 @@ def rollout(reward: Any, seed: int = 0, steps: int = 30) -> Rollout:
     return Rollout(states, actions, reward(states[:-1], TASK.clip(actions)))
 
 
+def rollouts_of(rewards: list[Any], steps: int = 20) -> Rollouts:
+    made = (rollout(reward, seed, steps=steps) for seed, reward in enumerate(rewards))
+    return Rollouts.from_list(made)
+
+
 @pytest.mark.parametrize(
     "reward",
     [
@@ -36,8 +41,8 @@ def rollout(reward: Any, seed: int = 0, steps: int = 30) -> Rollout:
         lambda s, a: (-0.1 * a[:, 0] ** 2).astype(np.float32),
     ],
 )
-def test_constants_and_prices_of_actions_tell_nothing(reward: Any) -> None:
-    assert not reward_depends_on_state([rollout(reward, seed) for seed in range(3)], TASK)
+def test_a_constant_less_a_cost_of_actions_does_not_depend_on_the_state(reward: Any) -> None:
+    assert not reward_depends_on_state(rollouts_of([reward] * 3, steps=30), TASK)
 
 
 @pytest.mark.parametrize(
@@ -47,23 +52,31 @@ def test_constants_and_prices_of_actions_tell_nothing(reward: Any) -> None:
         lambda s, a: -(s[:, 0] ** 2) - a[:, 0] ** 2,
         lambda s, a: -0.1 * a[:, 0] ** 2 + 100.0 * (np.arange(len(s)) == 17),  # a goal, once
         lambda s, a: 1e6 + s[:, 0],
-        lambda s, a: -((a[:, 0] - 0.5) ** 2),  # of actions alone, but to do nothing is not best
+        lambda s, a: (
+            -((a[:, 0] - 0.5) ** 2)
+        ),  # of actions alone, but the zero action is not the best
     ],
 )
-def test_what_depends_on_states_tells(reward: Any) -> None:
-    assert reward_depends_on_state([rollout(reward, seed) for seed in range(3)], TASK)
+def test_other_rewards_depend_on_the_state(reward: Any) -> None:
+    assert reward_depends_on_state(rollouts_of([reward] * 3, steps=30), TASK)
 
 
-def test_with_fewer_samples_than_terms_anything_but_a_constant_tells() -> None:
-    def of(reward: Any) -> Rollout:
-        return rollout(reward, steps=6)  # two actions have six terms
+def test_with_too_few_samples_for_a_fit_only_a_constant_does_not_depend_on_the_state() -> None:
+    # a quadratic in two actions has six terms
+    assert reward_depends_on_state(rollout(lambda s, a: s[:, 0], steps=6), TASK)
+    assert not reward_depends_on_state(rollout(lambda s, a: np.ones(len(s)), steps=6), TASK)
 
-    assert reward_depends_on_state([of(lambda s, a: s[:, 0])], TASK)
-    assert not reward_depends_on_state([of(lambda s, a: np.ones(len(s)))], TASK)
+
+def test_differences_of_rewards_count_from_two_ten_millionths_of_the_largest() -> None:
+    def reward(part: float) -> Any:
+        return lambda s, a: 100.0 + 100.0 * part * (np.arange(len(s)) == 17)
+
+    assert not reward_depends_on_state(rollout(reward(1.9e-7)), TASK)
+    assert reward_depends_on_state(rollout(reward(2.2e-7)), TASK)
 
 
 @pytest.mark.parametrize("name", ["kreps/SwingUp-v0", "kreps/Reaching-v0", "Pendulum-v1"])
-def test_one_roll_out_of_a_dense_reward_tells(name: str) -> None:
+def test_one_rollout_of_a_dense_reward_depends_on_the_state(name: str) -> None:
     learner = kreps.KREPS(gym.make(name), initial_rollouts=1, rollouts_per_iteration=1)
     learner.learn(1, progress=False)
     assert reward_depends_on_state(learner.state.window.rollouts, learner.task)
@@ -73,18 +86,18 @@ TINY: dict[str, Any] = {"initial_rollouts": 4, "rollouts_per_iteration": 2, "win
 
 
 @pytest.mark.parametrize("method", [kreps.KREPS, kreps.ValueIteration, kreps.NPALP])
-def test_slow_noise_at_the_limits_until_the_reward_tells(method: Any) -> None:
+def test_red_noise_at_the_limits_until_the_reward_depends_on_the_state(method: Any) -> None:
     learner = method(gym.make("MountainCarContinuous-v0"), seed=1, **TINY)
-    assert not learner.exploring  # its first policy is its own
+    assert not learner.exploring  # the first policy is that of the settings
     learner.learn(2, progress=False)
     assert learner.exploring
-    newest = learner.state.window.rollouts[2:]  # of the second iteration
-    np.testing.assert_array_equal(np.abs(np.concatenate([r.actions for r in newest])), 1.0)
-    longest = max(newest, key=len)
-    assert np.mean(longest.actions[1:] == longest.actions[:-1]) > 0.8  # white noise: one half
+    second = learner.state.window.rollouts[2:]  # of the second iteration
+    np.testing.assert_array_equal(np.abs(second.actions), 1.0)
+    longest = max(second, key=len)
+    assert np.mean(longest.actions[1:] == longest.actions[:-1]) > 0.8  # 0.5 for white noise
 
 
-def test_a_goal_seen_once_is_learnt_from() -> None:
+def test_one_rollout_that_reaches_the_goal_ends_the_exploration() -> None:
     learner = kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **TINY)
     learner.learn(1, progress=False)
     seen = learner.state.window.rollouts[0]
@@ -92,64 +105,72 @@ def test_a_goal_seen_once_is_learnt_from() -> None:
     learner.update([Rollout(seen.observations, seen.actions, rewards, terminated=True)])
     assert not learner.exploring
     learner.learn(1, progress=False)
-    actions = np.concatenate([r.actions for r in learner.state.window.rollouts[-2:]])
-    assert (np.abs(actions) != 1.0).any()  # it is the policy that acts
+    actions = learner.state.window.rollouts[-2:].actions
+    assert (np.abs(actions) != 1.0).any()  # as of a learnt policy, not of bang-bang noise
 
 
-def test_the_progress_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+def test_progress_shows_exploration(capsys: pytest.CaptureFixture[str]) -> None:
     kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **TINY).learn(1)
-    assert "no reward tells of the states: exploring" in capsys.readouterr().out
+    assert "no state-dependent reward: exploring" in capsys.readouterr().out
 
 
-def test_pink_noise_brings_the_rod_nearer_to_the_top_than_white_noise() -> None:
-    def at_the_top(exploration: str) -> float:
-        """Share of the states of four seeds that are near upright."""
+def test_pink_noise_swings_the_rod_up_more_often_than_white_noise() -> None:
+    def upright(noise: str) -> float:
+        """Fraction of the states of four seeds that are near upright."""
         shares = []
         for seed in (161, 162, 163, 164):
             env = gym.make("kreps/SwingUp-v0")
-            learner = kreps.KREPS(env, seed=seed, exploration=exploration)
+            learner = kreps.KREPS(env, seed=seed, exploration=kreps.Exploration(noise))
             learner.learn(1, progress=False)
-            angles = [r.observations[:, 0] for r in learner.state.window.rollouts]
-            shares.append(float(np.mean(np.abs(np.concatenate(angles)) < 0.5)))
+            angles = learner.state.window.rollouts.points[:, 0]
+            shares.append(float(np.mean(np.abs(angles) < 0.5)))
         return float(np.mean(shares))
 
-    assert at_the_top("pink") > 2.0 * at_the_top("gaussian")
+    assert upright("pink") > 2.0 * upright("gaussian")
 
 
-def test_first_roll_outs_are_as_the_seed_says() -> None:
+def test_the_same_seed_gives_the_same_first_rollouts() -> None:
     def actions() -> np.ndarray:
-        learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=5, exploration="pink", **TINY)
+        pink = kreps.Exploration("pink")
+        learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=5, exploration=pink, **TINY)
         learner.learn(1, progress=False)
-        return np.concatenate([r.actions for r in learner.state.window.rollouts])
+        return learner.state.window.rollouts.actions
 
     np.testing.assert_array_equal(actions(), actions())
 
 
-# ---- what is remembered -----------------------------------------------------------------------
+# ---- what the window keeps --------------------------------------------------------------------
 
-PRICE = lambda s, a: -0.1 * a[:, 0] ** 2  # noqa: E731
+COST = lambda s, a: -0.1 * a[:, 0] ** 2  # noqa: E731
 GOAL = lambda s, a: -0.1 * a[:, 0] ** 2 + 100.0 * (np.arange(len(s)) == 5)  # noqa: E731
 
 
-def of_rewards(rewards: list[Any], steps: int = 20) -> list[Rollout]:
-    return [rollout(reward, seed, steps=steps) for seed, reward in enumerate(rewards)]
-
-
-def test_one_roll_out_tells_if_it_is_long_enough() -> None:
+def test_a_rollout_is_informative_if_it_is_long_enough_and_reaches_the_goal() -> None:
     assert is_informative(rollout(GOAL, steps=7), TASK)  # two actions have six terms
     assert not is_informative(rollout(GOAL, steps=6), TASK)
-    assert not is_informative(rollout(PRICE, steps=20), TASK)
+    assert not is_informative(rollout(COST, steps=20), TASK)
 
 
-def test_a_roll_out_that_tells_nothing_is_noticed_unless_it_is_too_short_to_know() -> None:
-    telling = [rollout(GOAL, seed, steps=20) for seed in range(3)]
-    assert all_rollouts_informative(telling, TASK)
-    assert not all_rollouts_informative([*telling, rollout(PRICE, steps=20)], TASK)
+def test_rollouts_that_are_too_short_to_decide_do_not_count_as_uninformative() -> None:
+    window = ReplayWindow(TASK, None).append(rollouts_of([GOAL] * 3))
+    assert window.informative == (True, True, True) and window.all_informative
+    assert not window.append([rollout(COST, steps=20)]).all_informative
+    assert not window.append([rollout(COST, steps=7)]).all_informative
     for steps in (1, 6):
-        assert all_rollouts_informative([*telling, rollout(PRICE, steps=steps)], TASK)
+        longer = window.append([rollout(COST, steps=steps)])
+        assert longer.informative == (True, True, True, False) and longer.all_informative
     learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=0)
     learner.learn(1, progress=False)
-    assert all_rollouts_informative(learner.state.window.rollouts, learner.task)
+    assert learner.state.window.all_informative
+
+
+def test_the_window_depends_on_the_state_with_one_reward_that_does() -> None:
+    window = ReplayWindow(TASK, 6).append(rollouts_of([GOAL] + [COST] * 8))
+    assert window.reward_depends_on_state
+    assert not window.newest_depend_on_state
+    assert window.append([rollout(GOAL)]).newest_depend_on_state
+    assert not ReplayWindow(TASK, 6).newest_depend_on_state
+    assert not ReplayWindow(TASK, 6).append(rollouts_of([COST] * 8)).reward_depends_on_state
 
 
 @pytest.mark.parametrize(
@@ -164,31 +185,38 @@ def test_a_roll_out_that_tells_nothing_is_noticed_unless_it_is_too_short_to_know
     ],
 )
 @pytest.mark.parametrize("before", [0, 3, 6])
-def test_a_third_of_the_window_is_for_those_that_tell(
+def test_a_third_of_the_window_is_reserved_for_informative_rollouts(
     before: int, goals: list[int], kept: list[int]
 ) -> None:
-    seen = of_rewards([GOAL if i in goals else PRICE for i in range(10)])
-    window = ReplayWindow(6, tuple(seen[:before]))
-    found = append(window, seen[before:], TASK)
+    seen = rollouts_of([GOAL if i in goals else COST for i in range(10)])
+    found = ReplayWindow(TASK, 6).append(seen[:before]).append(seen[before:])
     assert found.capacity == 6
-    assert [next(i for i, r in enumerate(seen) if r is one) for one in found.rollouts] == kept
+    assert numbers(found.rollouts, seen) == kept
+    assert found.informative == tuple(i in goals for i in kept)
+
+
+def numbers(found: Rollouts, seen: Rollouts) -> list[int]:
+    """Number in ``seen`` of each rollout, by its first observation."""
+    starts = [tuple(r.observations[0]) for r in seen]
+    return [starts.index(tuple(r.observations[0])) for r in found]
 
 
 @pytest.mark.parametrize("capacity", [None, 20, 10])
-def test_what_there_is_room_for_is_kept(capacity: int | None) -> None:
-    seen = of_rewards([PRICE, GOAL] * 5)
-    found = append(ReplayWindow(capacity, tuple(seen[:4])), seen[4:], TASK)
-    assert found == ReplayWindow(capacity, tuple(seen))
+def test_all_rollouts_are_kept_while_they_fit(capacity: int | None) -> None:
+    seen = rollouts_of([COST, GOAL] * 5)
+    found = ReplayWindow(TASK, capacity).append(seen[:4]).append(seen[4:])
+    assert numbers(found.rollouts, seen) == list(range(10))
+    assert found.informative == (False, True) * 5
 
 
 @pytest.mark.parametrize(("capacity", "count"), [(None, 10), (30, 10), (12, 8), (6, 4), (2, 2)])
-def test_the_latest_are_those_in_no_reserved_place(capacity: int | None, count: int) -> None:
-    seen = of_rewards([PRICE] * 10)
-    window = append(ReplayWindow(capacity), seen, TASK)
-    assert tuple(newest(window)) == tuple(seen[-count:])
+def test_the_newest_are_as_many_as_are_not_reserved(capacity: int | None, count: int) -> None:
+    seen = rollouts_of([COST] * 10)
+    window = ReplayWindow(TASK, capacity).append(seen)
+    assert numbers(window.newest, seen) == list(range(10))[-count:]
 
 
-def test_it_explores_again_though_a_goal_is_remembered() -> None:
+def test_it_explores_again_while_only_a_reserved_rollout_reached_the_goal() -> None:
     learner = kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **TINY | {"window": 6})
     learner.learn(1, progress=False)
     seen = learner.state.window.rollouts[0]
@@ -198,4 +226,6 @@ def test_it_explores_again_though_a_goal_is_remembered() -> None:
     assert not learner.exploring
     idle = [replace(r, rewards=-0.1 * np.clip(r.actions[:, 0], -1, 1) ** 2) for r in [seen] * 4]
     learner.update(idle)
-    assert goal in learner.state.window.rollouts and learner.exploring
+    kept = [r for r in learner.state.window.rollouts if r.terminated]
+    assert len(kept) == 1 and kept[0].rewards[-1] == 100.0
+    assert learner.exploring

@@ -1,4 +1,4 @@
-"""ONNX models against the policies they were made from, by the runtime that robots use."""
+"""ONNX models, evaluated by ONNX Runtime, against the policies that they were made from."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, StorageError
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Kernel
-from kreps.learning import onnx as export
+from kreps.learning.storage import onnx as export
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 from kreps.policies.sparse_gp import SparseGP
 from kreps.policies.value_based import LipschitzPolicy
@@ -75,12 +75,12 @@ def random_policy(task: TaskSpec, n: int = 150, noise: float = 0.2) -> kreps.Pol
 
 @pytest.fixture(scope="module")
 def learnt() -> dict[int, kreps.Policy]:
-    """Policies of the swing-up, by seed: one of one step in each update, one by default."""
+    """Policies of the swing-up by seed, learnt with the presets single_step and model_based."""
     return {
-        seed: kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=seed, recipe=recipe)
+        seed: kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=seed, preset=preset)
         .learn(8, progress=False)
         .policy
-        for seed, recipe in ((100, "observed"), (101, "default"))
+        for seed, preset in ((100, "single_step"), (101, "model_based"))
     }
 
 
@@ -118,7 +118,7 @@ def errors(policy: kreps.Policy, path: Path, states: FloatArray, dtype: str) -> 
 @pytest.mark.parametrize("dtype", TOLERANCES)
 @pytest.mark.parametrize("centres", [None, 20])
 @pytest.mark.parametrize("task", TASKS.values(), ids=TASKS)
-def test_a_model_gives_what_the_policy_gives(
+def test_a_model_computes_what_the_policy_computes(
     task: TaskSpec, centres: int | None, dtype: str, tmp_path: Path
 ) -> None:
     policy = random_policy(task)
@@ -129,7 +129,7 @@ def test_a_model_gives_what_the_policy_gives(
     far = 50.0 + states_of(task, 5, 2)
     at = np.concatenate([states_of(task, 300, 3), own.states, far])
     spread = own.standard_deviation(at)
-    assert spread.max() > 1.2 * spread.min()  # the states tell apart what is known and what not
+    assert spread.max() > 1.2 * spread.min()  # some states are close to samples, others are not
     assert np.ptp(policy.predict(at, deterministic=True)[0], axis=0).min() > 0.1
     assert max(errors(policy, tmp_path / "policy.onnx", at, dtype)) < TOLERANCES[dtype]
 
@@ -137,7 +137,7 @@ def test_a_model_gives_what_the_policy_gives(
 @pytest.mark.parametrize("dtype", TOLERANCES)
 @pytest.mark.parametrize("centres", [None, 50])
 @pytest.mark.parametrize("seed", [100, 101])
-def test_a_model_of_a_learnt_policy_gives_what_it_gives(
+def test_a_model_of_a_learnt_policy_computes_what_the_policy_computes(
     seed: int, centres: int | None, dtype: str, learnt: dict[int, kreps.Policy], tmp_path: Path
 ) -> None:
     rng, policy = np.random.default_rng(4), learnt[seed]
@@ -163,7 +163,7 @@ def test_compressed_policies_are_computed_in_single_precision(
         }
 
 
-def test_what_single_precision_cannot_hold_is_computed_in_double(tmp_path: Path) -> None:
+def test_weights_beyond_single_precision_are_computed_in_double(tmp_path: Path) -> None:
     """With little noise, weights are huge and of alternating sign."""
     policy, at = random_policy(TASKS["plain"], 300, 1e-4), states_of(TASKS["plain"], 300, 5)
     assert isinstance(policy.process, CostSensitiveGP)
@@ -174,10 +174,10 @@ def test_what_single_precision_cannot_hold_is_computed_in_double(tmp_path: Path)
     assert max(errors(policy, tmp_path / "x.onnx", at, "float32")) < 1e-6
 
 
-def test_single_precision_is_as_bad_as_foretold(
+def test_the_error_of_single_precision_is_near_its_bound(
     monkeypatch: pytest.MonkeyPatch, learnt: dict[int, kreps.Policy], tmp_path: Path
 ) -> None:
-    """Forced where it is refused, its error is below the bound, and not by orders."""
+    """Also where it is not used, its error is below the bound, by less than three decades."""
     monkeypatch.setattr(export, "SINGLE_PRECISION_TOLERANCE", np.inf)
     policies = [
         *learnt.values(),
@@ -210,7 +210,7 @@ def test_single_precision_is_as_bad_as_foretold(
 
 
 def test_coordinates_far_from_zero_keep_their_digits_in_single_precision(tmp_path: Path) -> None:
-    """A position of 10 km in m: what counts is the distance from the centres."""
+    """A position of 10 km in m: the kernel depends on distances from the centres only."""
     task = TaskSpec(2, [-1.0], [1.0])
     rng = np.random.default_rng(7)
     base = 1e4 + np.round(rng.normal(size=(400, 2)) * 256.0) / 256.0  # exact in single precision
@@ -271,14 +271,14 @@ def test_a_batch_may_be_empty(dtype: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("dtype", TOLERANCES)
-def test_no_observation_becomes_a_number_by_mistake(dtype: str, tmp_path: Path) -> None:
+def test_observations_that_are_not_finite_give_nan(dtype: str, tmp_path: Path) -> None:
     random_policy(TASKS["swing-up"]).export_onnx(tmp_path / "x.onnx", dtype)
     bad = np.array([[np.nan, 0.0], [0.0, np.nan], [np.inf, 0.0]], dtype=dtype)
     for found in session(tmp_path / "x.onnx").run(None, {"observation": bad}):
         assert np.isnan(found).all()
 
 
-# ---- what a model says of itself --------------------------------------------------------------
+# ---- metadata ---------------------------------------------------------------------------------
 
 
 def test_names_and_shapes_are_those_of_the_documentation(tmp_path: Path) -> None:
@@ -321,7 +321,7 @@ def test_a_loaded_policy_gives_the_same_model(tmp_path: Path) -> None:
     assert (tmp_path / "a").read_bytes() == (tmp_path / "b").read_bytes()
 
 
-# ---- what is refused --------------------------------------------------------------------------
+# ---- errors -----------------------------------------------------------------------------------
 
 
 def lipschitz() -> kreps.Policy:
@@ -333,14 +333,14 @@ def lipschitz() -> kreps.Policy:
     )
 
 
-def test_a_policy_that_is_no_process_is_refused_with_a_remedy(tmp_path: Path) -> None:
+def test_a_policy_that_is_not_a_gaussian_process_is_rejected_with_a_remedy(tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"LipschitzPolicy.*kreps\.KREPS"):
         lipschitz().export_onnx(tmp_path / "x.onnx")
     assert not [*tmp_path.iterdir()]
 
 
 @pytest.mark.parametrize("dtype", ["float16", "", "double", None, np.float32, ["float32"]])
-def test_another_dtype_is_refused(dtype: Any, tmp_path: Path) -> None:
+def test_an_unknown_dtype_is_rejected(dtype: Any, tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="float64, float32"):
         random_policy(TASKS["plain"]).export_onnx(tmp_path / "x.onnx", dtype)
     assert not [*tmp_path.iterdir()]
@@ -361,7 +361,7 @@ def test_without_onnx_the_remedy_is_named(tmp_path: Path, monkeypatch: pytest.Mo
     assert not [*tmp_path.iterdir()]
 
 
-def test_numbers_beyond_single_precision_are_refused(tmp_path: Path) -> None:
+def test_numbers_beyond_single_precision_are_rejected(tmp_path: Path) -> None:
     task = TaskSpec(1, [-1e60], [1e60])
     process = CostSensitiveGP(
         task,

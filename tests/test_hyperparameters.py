@@ -1,4 +1,4 @@
-"""Leave-one-out criteria against explicit refits and finite differences; the bounded search."""
+"""Leave-one-out losses against explicit refits and finite differences; the bounded search."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_the_gradient_of_the_policy_loss_of_means(actions: int, shift: float) ->
 
 
 @pytest.mark.parametrize("actions", [1, 2])
-def test_means_of_equal_states_have_the_expected_density_of_all_of_them(actions: int) -> None:
+def test_the_loss_of_means_is_the_expected_loss_of_their_actions(actions: int) -> None:
     """Each target is the mean of five actions, whose densities follow from other states only."""
     loss, x, parameters = policy_case(12, 13, actions)
     rng = np.random.default_rng(14)
@@ -165,7 +165,7 @@ def test_means_of_equal_states_have_the_expected_density_of_all_of_them(actions:
     assert of_means(parameters)[0] == pytest.approx(wanted, rel=1e-6)
 
 
-def test_factor_distances_stack_the_factors() -> None:
+def test_factor_distances_are_those_of_each_factor() -> None:
     x = inputs(12, 5)
     found = factor_distances(FACTORS, x)
     assert found.shape == (3, 12, 12)
@@ -184,7 +184,7 @@ def box(parameters: FloatArray, half_width: float, strength: float = 0.0) -> Pri
     )
 
 
-def test_a_prior_is_a_sum_of_gaussians() -> None:
+def test_a_prior_is_a_sum_of_quadratic_penalties() -> None:
     prior = Prior(
         centre=np.array([1.0, -2.0]),
         std=np.array([0.5, 3.0]),
@@ -224,20 +224,20 @@ def test_the_search_recovers_the_lengthscale_of_smooth_data() -> None:
 
 def test_the_search_begins_at_the_best_of_its_starts() -> None:
     loss, _, parameters = embedding_case(60, 15)
-    lost = np.append(
+    flat = np.append(
         np.full(3, -7.0), parameters[-1]
     )  # lengthscales so short that nothing is predicted
     prior = box(parameters, 12.0)
-    np.testing.assert_allclose(loss(lost)[1], 0.0, atol=1e-12)
-    np.testing.assert_array_equal(minimise(loss, prior, lost), lost)
+    np.testing.assert_allclose(loss(flat)[1], 0.0, atol=1e-12)
+    np.testing.assert_array_equal(minimise(loss, prior, flat), flat)
     wanted = minimise(loss, prior, parameters)
-    for starts in ((lost, parameters), (parameters, lost)):
+    for starts in ((flat, parameters), (parameters, flat)):
         np.testing.assert_array_equal(minimise(loss, prior, *starts), wanted)
-    assert loss(wanted)[0] < loss(lost)[0]
+    assert loss(wanted)[0] < loss(flat)[0]
 
 
 @pytest.mark.parametrize("half_width", [0.01, 0.3])
-def test_the_search_stays_in_its_box(half_width: float) -> None:
+def test_the_search_stays_within_the_box(half_width: float) -> None:
     loss, _, parameters = embedding_case(30, 8)
     prior = box(parameters, half_width)
     found = minimise(loss, prior, parameters)

@@ -1,4 +1,4 @@
-"""Kernels against the textbook formulas, and the properties that make them kernels."""
+"""Kernels against the textbook formulas; symmetry, positive semi-definiteness, lengthscales."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from kreps.kernels.kernel import (
 )
 from kreps.kernels.pivoted_cholesky import pivoted_gaussian_gram
 
-# The same examples in every run: a failure can then be repeated.
-repeatable = settings(max_examples=60, deadline=None, derandomize=True)
+# The same examples in every run, so that a failure can be reproduced.
+reproducible = settings(max_examples=60, deadline=None, derandomize=True)
 
 lengthscales = st.floats(0.2, 5.0)
 values = st.floats(-10.0, 10.0, allow_subnormal=False)
 
 
-def inputs(columns: int, least: int = 1, most: int = 12) -> st.SearchStrategy[FloatArray]:
-    return st.integers(least, most).flatmap(
+def inputs(columns: int, min_rows: int = 1, max_rows: int = 12) -> st.SearchStrategy[FloatArray]:
+    return st.integers(min_rows, max_rows).flatmap(
         lambda rows: arrays(np.float64, (rows, columns), elements=values)
     )
 
@@ -48,7 +48,7 @@ def periodic(x: float, y: float, lengthscale: float) -> float:
     return math.exp(-2.0 * math.sin((x - y) / 2.0) ** 2 / lengthscale**2)
 
 
-@repeatable
+@reproducible
 @given(inputs(4), inputs(4), lengthscales, lengthscales, lengthscales)
 def test_a_product_kernel_is_the_product_of_the_textbook_formulas(
     x: FloatArray, y: FloatArray, a: float, b: float, c: float
@@ -68,7 +68,7 @@ def test_a_product_kernel_is_the_product_of_the_textbook_formulas(
     np.testing.assert_allclose(gram, wanted, rtol=1e-8, atol=1e-10)
 
 
-@repeatable
+@reproducible
 @given(inputs(4), lengthscales, lengthscales, lengthscales)
 def test_a_gram_matrix_is_symmetric_with_unit_diagonal_and_positive_semi_definite(
     x: FloatArray, a: float, b: float, c: float
@@ -81,18 +81,18 @@ def test_a_gram_matrix_is_symmetric_with_unit_diagonal_and_positive_semi_definit
     assert np.linalg.eigvalsh(gram).min() >= -1e-10
 
 
-@repeatable
+@reproducible
 @given(inputs(4), lengthscales, lengthscales, lengthscales)
-def test_one_set_of_inputs_or_twice_the_same_gives_one_matrix(
+def test_the_gram_matrix_of_one_set_equals_that_of_the_set_with_its_copy(
     x: FloatArray, a: float, b: float, c: float
 ) -> None:
     kernel = mixed_kernel(a, b, c)
     np.testing.assert_allclose(kernel.gram(x), kernel.gram(x, x.copy()), atol=1e-9)
 
 
-@repeatable
+@reproducible
 @given(inputs(4), inputs(4), lengthscales, st.integers(-3, 3))
-def test_a_periodic_coordinate_does_not_feel_full_turns_and_the_others_do(
+def test_full_turns_change_nothing_in_periodic_coordinates_only(
     x: FloatArray, y: FloatArray, a: float, turns: int
 ) -> None:
     kernel = mixed_kernel(a, 1.0, 1.0)
@@ -102,7 +102,7 @@ def test_a_periodic_coordinate_does_not_feel_full_turns_and_the_others_do(
     assert kernel.gram(shifted, x[:1])[0, 0] == pytest.approx(math.exp(-2.0 * math.pi**2))
 
 
-def test_a_periodic_kernel_takes_the_short_way_round() -> None:
+def test_a_periodic_kernel_depends_on_the_shorter_arc() -> None:
     kernel = Kernel((Periodic((0,)),), np.array([0.5]))
     near, far = kernel.gram(np.array([[np.pi - 0.1]]), np.array([[-np.pi + 0.1], [0.0]]))[0]
     assert near == pytest.approx(periodic(0.2, 0.0, 0.5))
@@ -110,7 +110,7 @@ def test_a_periodic_kernel_takes_the_short_way_round() -> None:
 
 
 @pytest.mark.parametrize("offset", [1e4, 1e6])
-def test_a_large_common_offset_does_not_spoil_the_gram_matrix(offset: float) -> None:
+def test_a_large_common_offset_does_not_change_the_gram_matrix(offset: float) -> None:
     rng = np.random.default_rng(0)
     # Multiples of 2^-20, so that adding the offset rounds nothing away.
     x = np.round(rng.normal(size=(40, 3)) * 2**20) / 2**20
@@ -121,7 +121,7 @@ def test_a_large_common_offset_does_not_spoil_the_gram_matrix(offset: float) -> 
     )
 
 
-def test_gaussian_gram_leaves_its_arguments_alone() -> None:
+def test_gaussian_gram_does_not_change_its_arguments() -> None:
     rng = np.random.default_rng(1)
     e, f = rng.normal(size=(6, 2)), rng.normal(size=(4, 2))
     before = e.copy(), f.copy()
@@ -131,16 +131,16 @@ def test_gaussian_gram_leaves_its_arguments_alone() -> None:
     np.testing.assert_array_equal(f, before[1])
 
 
-@repeatable
+@reproducible
 @given(inputs(3), lengthscales)
-def test_the_embedding_carries_the_kernel(x: FloatArray, lengthscale: float) -> None:
+def test_the_kernel_is_gaussian_in_the_embedding(x: FloatArray, lengthscale: float) -> None:
     kernel = Kernel((Periodic((2,)), SquaredExponential((0, 1))), np.array([lengthscale, 0.7]))
     e = kernel.embed(x)
     distances = ((e[:, None] - e) ** 2).sum(axis=2)
     np.testing.assert_allclose(np.exp(-0.5 * distances), kernel.gram(x), atol=1e-9)
 
 
-def test_new_lengthscales_replace_the_old_ones_in_a_new_kernel() -> None:
+def test_with_lengthscales_makes_a_new_kernel() -> None:
     kernel = Kernel(factors_of(1), np.array([1.0]))
     wider = kernel.with_lengthscales(np.array([3.0]))
     x, y = np.array([[0.0]]), np.array([[1.5]])
@@ -156,7 +156,7 @@ def test_one_factor_per_column_periodic_where_named() -> None:
     )
 
 
-@repeatable
+@reproducible
 @given(inputs(2))
 def test_squared_distances_of_a_squared_exponential(x: FloatArray) -> None:
     found = squared_distances(SquaredExponential((0, 1)).coordinates(x))
@@ -165,13 +165,13 @@ def test_squared_distances_of_a_squared_exponential(x: FloatArray) -> None:
     np.testing.assert_array_equal(np.diagonal(found), 0.0)
 
 
-def test_squared_distances_do_not_feel_a_large_common_offset() -> None:
+def test_a_large_common_offset_does_not_change_squared_distances() -> None:
     x = np.round(np.random.default_rng(6).normal(size=(30, 2)) * 2**20) / 2**20
     wanted = squared_distances(x)
     np.testing.assert_allclose(squared_distances(x + 1e6), wanted, atol=1e-8)
 
 
-@repeatable
+@reproducible
 @given(inputs(2))
 def test_squared_distances_of_a_periodic_factor_are_those_of_chords(x: FloatArray) -> None:
     found = squared_distances(Periodic((1,)).coordinates(x))
@@ -200,7 +200,7 @@ def test_a_constant_column_gets_lengthscale_one(rows: int, value: float) -> None
     np.testing.assert_array_equal(found, 1.0)
 
 
-def test_duplicates_say_nothing_about_scale() -> None:
+def test_duplicates_do_not_change_median_lengthscales() -> None:
     rng = np.random.default_rng(4)
     x = rng.normal(size=(30, 2))
     many = np.concatenate([x, x, x])
@@ -223,9 +223,9 @@ def test_the_median_is_taken_over_a_random_sample_of_many_rows() -> None:
     np.testing.assert_allclose(found, 0.954, rtol=0.15)
 
 
-def test_duplicated_rows_in_many_coordinates_do_not_enter_twice() -> None:
-    # Rounding grows with the coordinates: a diagonal that is a little less than one in whole
-    # columns, but one in small blocks, would leave residuals that are not there.
+def test_duplicated_rows_in_many_coordinates_give_one_pivot() -> None:
+    # Rounding grows with the number of coordinates.  If a diagonal entry were slightly below one in
+    # whole columns but one in small blocks, duplicates would seem to have a residual.
     rng = np.random.default_rng(0)
     x = np.repeat(rng.normal(size=(150, 60)), 2, axis=0)
     kernel = Kernel((SquaredExponential(tuple(range(60))),), np.array([5.0]))

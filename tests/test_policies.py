@@ -1,4 +1,4 @@
-"""The cost-sensitive Gaussian process, and the first policies."""
+"""The cost-sensitive Gaussian process policy, and the policies of the first rollouts."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def fit(
     return CostSensitiveGP(task, KERNEL, states, targets, weights, SIGNAL, NOISE)
 
 
-def test_mean_and_deviation_are_those_of_the_equations() -> None:
+def test_mean_and_standard_deviation_follow_the_equations() -> None:
     states, targets, weights = samples(25, 0)
     policy = fit(states, targets, weights)
     query = np.random.default_rng(1).normal(size=(8, 2))
@@ -74,7 +74,7 @@ def test_far_from_all_samples_the_policy_is_its_prior() -> None:
     np.testing.assert_allclose(policy.standard_deviation(far), wanted, rtol=1e-12)
 
 
-def test_at_a_heavy_sample_the_mean_is_its_target_and_only_the_noise_is_left() -> None:
+def test_at_a_sample_of_large_weight_the_mean_is_its_target_and_the_variance_the_noise() -> None:
     states, targets, weights = samples(10, 6)
     weights[4] = 1e7
     policy = fit(states, targets, weights)
@@ -84,15 +84,15 @@ def test_at_a_heavy_sample_the_mean_is_its_target_and_only_the_noise_is_left() -
     np.testing.assert_allclose(policy.standard_deviation(states[4:5]), spread, rtol=1e-5)
 
 
-def test_a_lighter_sample_pulls_less() -> None:
+def test_a_sample_of_smaller_weight_has_less_effect() -> None:
     state, target = np.zeros((1, 2)), np.ones((1, 2))
     means = [fit(state, target, np.array([w])).mean(state)[0, 0] for w in (0.1, 1.0, 10.0)]
     # One sample: sf2 / (sf2 + l / w).
     np.testing.assert_allclose(means, [SIGNAL / (SIGNAL + NOISE / w) for w in (0.1, 1.0, 10.0)])
 
 
-def test_the_predictor_needs_few_centres_of_a_dense_support() -> None:
-    """What it leaves out of a support point's prior variance is next to nothing of its noise."""
+def test_dense_support_points_are_projected_on_few_centres() -> None:
+    """The centres leave out at most 1e-4 of the noise of a support point's prior variance."""
     rng = np.random.default_rng(20)
     states, weights = rng.normal(size=(500, 2)), rng.uniform(0.1, 4.0, 500)
     targets = np.sign(rng.normal(size=(500, 2)))
@@ -113,20 +113,20 @@ def test_the_predictor_needs_few_centres_of_a_dense_support() -> None:
 
 
 @pytest.mark.parametrize(("signal", "weight"), [(1e-200, 1e-200), (1e200, 1e200)])
-def test_extreme_weights_are_served(signal: float, weight: float) -> None:
+def test_extreme_weights_give_finite_actions(signal: float, weight: float) -> None:
     states, targets, _ = samples(20, 24)
     policy = CostSensitiveGP(TASK, KERNEL, states, targets, np.full(20, weight), signal, NOISE)
     assert np.isfinite(policy.mean(states)).all()
     assert (policy.standard_deviation(states) > 0.0).all()
 
 
-def test_next_to_no_noise_does_not_make_all_support_points_centres() -> None:
+def test_a_tiny_noise_does_not_make_all_support_points_centres() -> None:
     states = np.random.default_rng(25).normal(size=(400, 2))
     policy = CostSensitiveGP(TASK, KERNEL, states, states, np.ones(400), 1.0, 1e-12)
     assert len(policy.predictor.states) < 200
 
 
-def test_support_points_that_are_all_unlike_are_all_centres() -> None:
+def test_dissimilar_support_points_are_all_centres() -> None:
     states = 50.0 * np.random.default_rng(23).normal(size=(40, 2))
     targets, weights = np.ones((40, 2)), np.ones(40)
     policy = fit(states, targets, weights)
@@ -134,7 +134,7 @@ def test_support_points_that_are_all_unlike_are_all_centres() -> None:
     assert policy.jitter == policy.factor.jitter
 
 
-def test_the_predictor_serves_duplicated_states() -> None:
+def test_duplicated_states_act_like_larger_weights() -> None:
     states, targets, weights = samples(20, 21)
     policy = fit(np.tile(states, (5, 1)), np.tile(targets, (5, 1)), np.tile(weights, 5))
     assert len(policy.predictor.coordinates) <= 20
@@ -143,7 +143,7 @@ def test_the_predictor_serves_duplicated_states() -> None:
     np.testing.assert_allclose(policy.mean(query), five_times.mean(query), atol=1e-5)
 
 
-def test_too_large_a_support_is_refused() -> None:
+def test_too_many_support_points_are_rejected() -> None:
     m = 6_001
     with pytest.raises(ConfigurationError, match=r"6001 support points, but at most 6000"):
         fit(np.zeros((m, 2)), np.zeros((m, 2)), np.ones(m))
@@ -165,7 +165,7 @@ def test_commanded_actions_are_not_clipped() -> None:
     assert (actions[1] < TASK.action_low).all()
 
 
-def test_the_action_scale_is_only_a_unit() -> None:
+def test_actions_scale_with_the_action_range() -> None:
     data = samples(20, 10)
     policy = fit(*data)
     unit = fit(*data, task=TaskSpec(2, np.full(2, -1.0), np.full(2, 1.0)))
@@ -176,14 +176,14 @@ def test_the_action_scale_is_only_a_unit() -> None:
     )
 
 
-def test_duplicated_states_without_noise_need_jitter_and_say_so() -> None:
+def test_duplicated_states_without_noise_need_jitter() -> None:
     states = np.zeros((3, 2))
     policy = CostSensitiveGP(TASK, KERNEL, states, np.ones((3, 2)), np.ones(3), 1.0, 1e-18)
     assert policy.factor.jitter > 0.0
     np.testing.assert_allclose(policy.mean(states), [[1.0, 30.0]] * 3, rtol=1e-3)
 
 
-def test_bang_bang_takes_the_limits_and_nothing_between() -> None:
+def test_bang_bang_actions_are_at_the_limits() -> None:
     noise = np.random.default_rng(12).normal(size=(2000, 2))
     actions = BangBang(TASK).act(np.zeros((2000, 2)), noise)
     np.testing.assert_array_equal(np.unique(actions[:, 0]), [-1.0, 1.0])
@@ -194,21 +194,21 @@ def test_bang_bang_takes_the_limits_and_nothing_between() -> None:
     assert abs(np.mean(high[:, 0] & high[:, 1]) - 0.25) < 0.05
 
 
-@pytest.mark.parametrize("spread", [0.05, 1.0, 2.5])
-def test_gaussian_exploration_has_the_spread_asked_for_in_every_state(spread: float) -> None:
+@pytest.mark.parametrize("scale", [0.05, 1.0, 2.5])
+def test_gaussian_exploration_has_the_given_scale_in_every_state(scale: float) -> None:
     rng = np.random.default_rng(13)
     states, noise = rng.normal(size=(4000, 2)), rng.normal(size=(4000, 2))
-    actions = Gaussian(TASK, spread).act(states, noise)
-    np.testing.assert_allclose(actions.std(axis=0), spread * np.array([1.0, 10.0]), rtol=0.05)
+    actions = Gaussian(TASK, scale).act(states, noise)
+    np.testing.assert_allclose(actions.std(axis=0), scale * np.array([1.0, 10.0]), rtol=0.05)
     np.testing.assert_allclose(
-        actions, [0.0, 20.0] + spread * np.array([1.0, 10.0]) * noise, rtol=1e-12
+        actions, [0.0, 20.0] + scale * np.array([1.0, 10.0]) * noise, rtol=1e-12
     )
 
 
-# ---- as their user holds them -----------------------------------------------------------------
+# ---- kreps.Policy -----------------------------------------------------------------------------
 
 
-def test_a_compressed_policy_acts_by_its_process_with_the_same_seed() -> None:
+def test_a_compressed_policy_acts_as_its_compressed_process() -> None:
     process, query = fit(*samples(60, 30)), np.random.default_rng(31).normal(size=(8, 2))
     few = Policy(process, seed=3).compressed(10)
     assert isinstance(few.process, SparseGP) and len(few.process.states) == 10
@@ -218,29 +218,29 @@ def test_a_compressed_policy_acts_by_its_process_with_the_same_seed() -> None:
     np.testing.assert_array_equal(few.predict(query)[0], again)
 
 
-def test_compressing_leaves_the_policy_as_it_was() -> None:
+def test_compressing_does_not_change_the_policy() -> None:
     policy, query = Policy(fit(*samples(60, 32))), np.zeros((3, 2))
     before = policy.predict(query, deterministic=True)[0]
     policy.compressed(5)
     np.testing.assert_array_equal(policy.predict(query, deterministic=True)[0], before)
 
 
-def test_a_compressed_policy_is_compressed_already() -> None:
+def test_a_compressed_policy_cannot_be_compressed_to_fewer_centres() -> None:
     few = Policy(fit(*samples(60, 33))).compressed(10)
     assert few.compressed(10) is few and few.compressed(11) is few
-    with pytest.raises(ConfigurationError, match=r"10 centres and no samples.*rank = 9"):
+    with pytest.raises(ConfigurationError, match=r"10 centres.*samples.*rank=9"):
         few.compressed(9)
 
 
 @pytest.mark.parametrize("centres", [0, -3, 2.5, "ten", None, np.array([3, 4])])
-def test_a_number_of_centres_that_is_none_is_refused(centres: Any) -> None:
+def test_an_invalid_number_of_centres_is_rejected(centres: Any) -> None:
     policy = Policy(fit(*samples(20, 34)))
     for each in (policy, policy.compressed(5)):
         with pytest.raises(ConfigurationError, match=r"centres = .*needed|centres = .*at least"):
             each.compressed(centres)
 
 
-def test_policies_without_samples_of_a_process_are_not_compressed() -> None:
+def test_only_gaussian_process_policies_can_be_compressed() -> None:
     kernel = Kernel(factors_of(2), np.ones(2))
     one, zero = np.zeros((1, 2)), np.zeros(1)
     for process in (
@@ -251,7 +251,7 @@ def test_policies_without_samples_of_a_process_are_not_compressed() -> None:
             Policy(process).compressed(5)
 
 
-def test_the_difference_of_a_compressed_policy_is_told() -> None:
+def test_the_difference_of_a_compressed_policy_is_the_rms_difference_of_means() -> None:
     exact = Policy(fit(*samples(200, 35)))
     differences = [mean_difference(exact, exact.compressed(c)) for c in (1, 10, 60)]
     assert differences[0] > 1.2 * differences[1] > 10.0 * differences[2]
@@ -263,7 +263,7 @@ def test_the_difference_of_a_compressed_policy_is_told() -> None:
     np.testing.assert_allclose(differences[1], wanted, rtol=1e-12)
 
 
-def test_predicting_holds_on_to_no_memory() -> None:
+def test_predicting_does_not_leak_memory() -> None:
     policy = Policy(fit(*samples(300, 36))).compressed(50)
     query = np.zeros(2)
     tracemalloc.start()

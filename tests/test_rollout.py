@@ -1,4 +1,4 @@
-"""Collecting roll-outs: in batches and step by step, and from environments that misbehave."""
+"""Collection of rollouts, in batches and step by step; faulty environments; evaluation."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.algorithms.reps import LearnerState
-from kreps.data.rollouts import Rollout
+from kreps.algorithms.state import LearnerState
+from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.envs.restart import stratified_lengths
 from kreps.envs.swing_up import SwingUp
@@ -28,9 +28,9 @@ TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "win
 
 
 class PointMass(gym.Env[Any, Any]):
-    """A plain environment: position and velocity, force within [-1, 1], noise on the force.
+    """An environment without batch model: position, velocity, force within [-1, 1] with noise.
 
-    ``spoil(step, observation, reward)`` may raise or return something else, to break it.
+    ``fault(step, observation, reward)`` may raise or return something else.
     """
 
     def __init__(self, **metadata: Any) -> None:
@@ -38,7 +38,7 @@ class PointMass(gym.Env[Any, Any]):
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
         self.action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
         self.applied: list[Any] = []
-        self.spoil: Any = lambda step, observation, reward: (observation, reward)
+        self.fault: Any = lambda step, observation, reward: (observation, reward)
         self.steps = 0  # of all episodes
 
     def reset(
@@ -46,7 +46,7 @@ class PointMass(gym.Env[Any, Any]):
     ) -> tuple[Any, dict[str, Any]]:
         super().reset(seed=seed)
         self.state = self.np_random.normal(size=2)
-        return self.spoil(self.steps, self.state.copy(), 0.0)[0], {}
+        return self.fault(self.steps, self.state.copy(), 0.0)[0], {}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         self.applied.append(action)
@@ -55,7 +55,7 @@ class PointMass(gym.Env[Any, Any]):
         reward = -float(self.state @ self.state)
         velocity = 0.9 * self.state[1] + 0.2 * force
         self.state = np.array([self.state[0] + 0.2 * velocity, velocity])
-        observation, reward = self.spoil(self.steps, self.state.copy(), reward)
+        observation, reward = self.fault(self.steps, self.state.copy(), reward)
         return observation, reward, False, False, {}
 
 
@@ -72,7 +72,7 @@ class EndsBeyond(gym.Wrapper[Any, Any, Any, Any]):
 
 
 class ThreeSteps:
-    """A batch model that counts up and really ends after three steps; with ways to break it."""
+    """A batch model that counts steps and terminates after three, with an optional fault."""
 
     def __init__(self, fault: str = "") -> None:
         self.fault = fault
@@ -116,7 +116,7 @@ def collected(
     iteration: int = 0,
     probability: float = 0.05,
     stratified: bool = False,
-) -> list[Rollout]:
+) -> Rollouts:
     return collect(
         env,
         task_of(env),
@@ -150,22 +150,21 @@ def test_collecting_in_batches_and_step_by_step_gives_the_same_data() -> None:
         np.testing.assert_allclose(a.rewards, b.rewards, rtol=0, atol=1e-9)
 
 
-def test_lengths_are_drawn_together_where_the_settings_say_so() -> None:
+def test_lengths_are_stratified_by_the_settings() -> None:
     def steps(**settings: Any) -> list[int]:
         learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=3, initial_rollouts=30, **settings)
         assert learner.env is not None
         return [len(rollout) for rollout in learner._collect(learner.env, None)]
 
     lengths = steps()
-    together = generator(3, Purpose.RESTART, 0)
-    assert lengths == stratified_lengths(together, 0.02, 30)
+    assert lengths == stratified_lengths(generator(3, Purpose.RESTART, 0), 0.02, 30)
     assert sum(lengths) == pytest.approx(1470, rel=0.1)
-    assert steps(restarts="independent") == steps(recipe="paper") != lengths
+    assert steps(rollout_lengths="independent") == steps(preset="paper") != lengths
     for other in (kreps.ValueIteration, kreps.NPALP):
-        assert other(gym.make("kreps/SwingUp-v0")).settings.restarts == "independent"
+        assert other(gym.make("kreps/SwingUp-v0")).settings.rollout_lengths == "independent"
 
 
-def test_lengths_drawn_together_differ_between_iterations_and_end_with_a_time_limit() -> None:
+def test_stratified_lengths_differ_between_iterations_and_end_with_a_time_limit() -> None:
     swing_up = gym.make("kreps/SwingUp-v0")
     batch, single, limited = (
         [collected(env, Linear(40.0), iteration=i, stratified=True) for i in (0, 1)]
@@ -211,7 +210,7 @@ def test_independent_lengths_are_those_of_the_restart_wrapper_with_the_same_seed
         assert len(rollout) == steps
 
 
-def test_seed_and_iteration_and_rollout_each_change_the_data() -> None:
+def test_data_differ_by_seed_iteration_and_rollout() -> None:
     first = collected(PointMass(), Linear(1.0))
     same = collected(PointMass(), Linear(1.0))
     other_seed = collected(PointMass(), Linear(1.0), seed=1)
@@ -233,17 +232,17 @@ def test_the_first_rollouts_of_independent_lengths_do_not_depend_on_how_many_fol
         np.testing.assert_array_equal(a.actions, b.actions)
 
 
-def test_commands_are_stored_unclipped_while_the_environment_gets_them_clipped() -> None:
+def test_actions_are_stored_as_commanded_and_clipped_for_the_environment() -> None:
     env = PointMass()
     rollouts = collected(env, Linear(5.0))
     commanded = np.concatenate([r.actions for r in rollouts])
     applied = np.array(env.applied)
-    assert np.abs(commanded).max() > 5.0  # so there was something to clip
+    assert np.abs(commanded).max() > 5.0  # beyond the limits
     assert all(a.shape == (1,) and a.dtype == np.float32 for a in env.applied)
     np.testing.assert_array_equal(applied, np.clip(commanded, -1.0, 1.0).astype(np.float32))
 
 
-def test_commands_of_the_batch_are_stored_unclipped_too() -> None:
+def test_actions_of_a_batch_are_stored_as_commanded_too() -> None:
     rollouts = collected(gym.make("kreps/SwingUp-v0"), Linear(200.0))
     commanded = np.concatenate([r.actions for r in rollouts])
     assert np.abs(commanded).max() > 100.0
@@ -257,37 +256,36 @@ def test_commands_of_the_batch_are_stored_unclipped_too() -> None:
 # ---- ends -------------------------------------------------------------------------------------
 
 
-def test_a_real_end_is_recorded_with_its_successor_and_other_ends_are_not() -> None:
+def test_termination_is_recorded_and_truncation_is_not() -> None:
     rollouts = collected(EndsBeyond(PointMass(), 1.2), Linear(2.0), count=20)
     ended = [r for r in rollouts if r.terminated]
-    cut = [r for r in rollouts if not r.terminated]
-    assert ended and cut  # of both kinds, or this shows nothing
+    truncated = [r for r in rollouts if not r.terminated]
+    assert ended and truncated  # of both kinds
     for rollout in ended:
         assert abs(rollout.observations[-1, 0]) > 1.2
-    for rollout in cut:
+    for rollout in truncated:
         assert (np.abs(rollout.observations[1:, 0]) <= 1.2).all()
 
 
-def test_truncation_by_a_time_limit_is_no_real_end() -> None:
+def test_truncation_by_a_time_limit_is_no_termination() -> None:
     env = gym.wrappers.TimeLimit(PointMass(), 4)
     rollouts = collected(env, Linear(1.0), probability=0.01)
     assert max(len(r) for r in rollouts) == 4
     assert not any(r.terminated for r in rollouts)
 
 
-def test_noise_is_drawn_for_no_more_steps_than_the_environment_allows() -> None:
-    env = gym.make("Pendulum-v1")  # cut off after 200 steps
+def test_noise_is_drawn_for_as_many_steps_as_the_time_limit_allows() -> None:
+    env = gym.make("Pendulum-v1")  # truncated after 200 steps
     task = task_of(env)
     options: dict[str, Any] = {"seed": 0, "iteration": 0, "restart_probability": 1e-9}
     (rollout,) = collect(env, task, BangBang(task), 1, **options, exponent=RED)
     assert len(rollout) == 200
     held = np.mean(rollout.actions[1:] == rollout.actions[:-1])
-    assert (
-        held < 0.999
-    )  # the slowest part of its noise is that of 200 steps, not of a thousand million
+    # the lowest frequency of its noise is that of 200 steps, not of the 1e9 of the restarts
+    assert held < 0.999
 
 
-def test_real_ends_in_a_batch_stop_their_own_rollout_only() -> None:
+def test_termination_in_a_batch_ends_that_rollout_only() -> None:
     env = InBatches()
     lengths = [1, 7, 3, 2]
     rollouts = simulate(
@@ -299,11 +297,14 @@ def test_real_ends_in_a_batch_stop_their_own_rollout_only() -> None:
     )
     assert [len(r) for r in rollouts] == [1, 3, 3, 2]
     assert [r.terminated for r in rollouts] == [False, True, True, False]
-    np.testing.assert_array_equal(rollouts[1].observations[:, 0], [0.0, 1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(rollouts.offsets, [0, 1, 4, 7, 9])
+    for rollout, length in zip(rollouts, [1, 3, 3, 2], strict=True):
+        np.testing.assert_array_equal(rollout.observations[:, 0], np.arange(length + 1.0))
+        assert rollout.actions.shape == (length, 1) and rollout.rewards.shape == (length,)
 
 
-def test_progress_of_collecting_is_told() -> None:
-    env, told = PointMass(), list[int]()
+def test_the_number_of_complete_rollouts_is_reported() -> None:
+    env, reported = PointMass(), list[int]()
     collect(
         env,
         task_of(env),
@@ -312,9 +313,9 @@ def test_progress_of_collecting_is_told() -> None:
         seed=0,
         iteration=0,
         restart_probability=0.2,
-        on_rollout=told.append,
+        on_rollout=reported.append,
     )
-    assert told == [1, 2, 3]
+    assert reported == [1, 2, 3]
 
 
 # ---- spaces -----------------------------------------------------------------------------------
@@ -339,7 +340,7 @@ class Spaces(PointMass):
         (BOX, gym.spaces.Box(0.0, np.inf, (1,)), "unbounded", "bounded Box"),
     ],
 )
-def test_spaces_that_cannot_be_served_say_which_why_and_what_to_do(
+def test_unsupported_spaces_raise_with_reason_and_remedy(
     observations: Any, actions: Any, which: str, remedy: str
 ) -> None:
     with pytest.raises(SpaceError) as caught:
@@ -347,11 +348,11 @@ def test_spaces_that_cannot_be_served_say_which_why_and_what_to_do(
     message = str(caught.value)
     assert which in message
     assert remedy in message
-    assert "needed" in message or "needs" in message  # why
+    assert ", as kernels" in message or ", as policies" in message or "explores" in message
     assert isinstance(caught.value, ConfigurationError)
 
 
-def test_the_remedy_for_dictionaries_works() -> None:
+def test_flattened_dictionaries_are_supported() -> None:
     space = gym.spaces.Dict({"a": BOX, "b": gym.spaces.Box(-1.0, 1.0, (2,))})
     env = gym.wrappers.FlattenObservation(Spaces(space, BOX))
     assert kreps.KREPS(env).task.observation_size == 3
@@ -418,29 +419,29 @@ def test_an_outermost_restart_wrapper_gives_the_learner_its_probability() -> Non
     assert without_restarts(env) == (env, None)
     learner = kreps.KREPS(kreps.RandomRestart(env, 0.07), seed=0)
     assert learner.settings.restart_probability == 0.07
-    assert learner.env is env  # restarts are not made twice
+    assert learner.env is env  # without the wrapper, as the learner restarts by itself
 
 
-def test_a_restart_wrapper_below_another_one_is_refused_with_its_remedy() -> None:
+def test_a_restart_wrapper_below_another_one_raises_with_a_remedy() -> None:
     env = gym.wrappers.TimeLimit(kreps.RandomRestart(PointMass()), 100)
     with pytest.raises(ConfigurationError, match="outermost"):
         kreps.KREPS(env)
 
 
-# ---- environments that misbehave ---------------------------------------------------------------
+# ---- faulty environments -----------------------------------------------------------------------
 
 
 def raise_at(step: int) -> Any:
-    def spoil(now: int, observation: Any, reward: Any) -> Any:
+    def fault(now: int, observation: Any, reward: Any) -> Any:
         if now == step:
             raise RuntimeError("motor 3 is on fire")
         return observation, reward
 
-    return spoil
+    return fault
 
 
 def replace_at(step: int, observation: Any = None, reward: Any = None) -> Any:
-    def spoil(now: int, true_observation: Any, true_reward: Any) -> Any:
+    def fault(now: int, true_observation: Any, true_reward: Any) -> Any:
         if now < step:
             return true_observation, true_reward
         return (
@@ -448,51 +449,51 @@ def replace_at(step: int, observation: Any = None, reward: Any = None) -> Any:
             true_reward if reward is None else reward,
         )
 
-    return spoil
+    return fault
 
 
 def sound(now: int, observation: Any, reward: Any) -> Any:
     return observation, reward
 
 
-def test_an_environment_that_raises_loses_nothing_and_learning_goes_on_once_mended() -> None:
+def test_after_an_exception_of_the_environment_learning_continues_unchanged() -> None:
     env = PointMass()
     learner = kreps.KREPS(env, seed=1, **TINY).learn(1, progress=False)
     before = learner.state
-    env.spoil = raise_at(env.steps + 10)
-    with pytest.raises(EnvironmentFailure, match=r"RuntimeError.*roll-out.*motor 3") as caught:
+    env.fault = raise_at(env.steps + 10)
+    with pytest.raises(EnvironmentFailure, match=r"RuntimeError.*rollout.*motor 3") as caught:
         learner.learn(1, progress=False)
     assert isinstance(caught.value.__cause__, RuntimeError)
     assert unchanged(learner, before)
-    env.spoil = sound
+    env.fault = sound
     learner.learn(1, progress=False)
-    untroubled = kreps.KREPS(PointMass(), seed=1, **TINY).learn(2, progress=False)
+    undisturbed = kreps.KREPS(PointMass(), seed=1, **TINY).learn(2, progress=False)
     states = np.random.default_rng(0).normal(size=(4, 2))
     np.testing.assert_array_equal(
         learner.policy.predict(states, deterministic=True)[0],
-        untroubled.policy.predict(states, deterministic=True)[0],
+        undisturbed.policy.predict(states, deterministic=True)[0],
     )
 
 
-def test_an_environment_that_raises_on_reset_is_a_failure_too() -> None:
+def test_an_exception_in_reset_is_a_failure_of_the_environment() -> None:
     env = PointMass()
-    env.spoil = raise_at(0)
+    env.fault = raise_at(0)
     with pytest.raises(EnvironmentFailure, match="after 0 steps: motor 3"):
         kreps.KREPS(env, **TINY).learn(1, progress=False)
 
 
-def test_a_keyboard_interrupt_in_the_environment_stays_one() -> None:
+def test_a_keyboard_interrupt_in_the_environment_is_not_converted() -> None:
     def interrupt(now: int, observation: Any, reward: Any) -> Any:
         raise KeyboardInterrupt
 
     env = PointMass()
-    env.spoil = interrupt
+    env.fault = interrupt
     with pytest.raises(KeyboardInterrupt):
         kreps.KREPS(env, **TINY).learn(1, progress=False)
 
 
 @pytest.mark.parametrize(
-    ("spoilt", "says"),
+    ("faultt", "says"),
     [
         ({"observation": [np.nan, 0.0]}, "NaN"),
         ({"observation": [0.0, np.inf]}, "NaN, an infinity"),
@@ -502,18 +503,18 @@ def test_a_keyboard_interrupt_in_the_environment_stays_one() -> None:
         ({"observation": [0.0]}, "1"),
     ],
 )
-def test_bad_data_from_an_environment_are_refused_and_change_nothing(
-    spoilt: dict[str, Any], says: str
+def test_invalid_data_of_an_environment_raise_and_leave_the_learner_unchanged(
+    faultt: dict[str, Any], says: str
 ) -> None:
     env = PointMass()
     learner = kreps.KREPS(env, seed=1, **TINY).learn(1, progress=False)
     before = learner.state
-    env.spoil = replace_at(env.steps + 10, **spoilt)
-    with pytest.raises(DataError, match=r"roll-out \d+") as caught:
+    env.fault = replace_at(env.steps + 10, **faultt)
+    with pytest.raises(DataError, match=r"rollout \d+") as caught:
         learner.learn(1, progress=False)
     assert says in str(caught.value)
     assert unchanged(learner, before)
-    env.spoil = sound
+    env.fault = sound
     learner.learn(1, progress=False)
     assert learner.state.iteration == 2
 
@@ -521,21 +522,21 @@ def test_bad_data_from_an_environment_are_refused_and_change_nothing(
 @pytest.mark.parametrize(
     ("observation", "says"), [([np.nan, 0.0], "NaN"), ([0.0, 0.0, 0.0], "3"), ([], "0")]
 )
-def test_a_bad_first_observation_is_named_as_such(observation: list[float], says: str) -> None:
+def test_an_invalid_first_observation_raises(observation: list[float], says: str) -> None:
     env = PointMass()
-    env.spoil = replace_at(0, observation=observation)
+    env.fault = replace_at(0, observation=observation)
     with pytest.raises(DataError, match="observation") as caught:
         kreps.KREPS(env, **TINY).learn(1, progress=False)
     assert says in str(caught.value)
 
 
-def test_a_batch_that_raises_is_a_failure_of_the_environment() -> None:
+def test_an_exception_of_a_batch_model_is_a_failure_of_the_environment() -> None:
     with pytest.raises(EnvironmentFailure, match="lost its licence"):
         kreps.KREPS(InBatches("raise"), **TINY).learn(1, progress=False)
 
 
 @pytest.mark.parametrize("fault", ["nan", "shape"])
-def test_a_batch_with_bad_data_is_refused(fault: str) -> None:
+def test_invalid_data_of_a_batch_model_raise(fault: str) -> None:
     learner = kreps.KREPS(InBatches(fault), **TINY)
     before = learner.state
     with pytest.raises(DataError):
@@ -543,33 +544,72 @@ def test_a_batch_with_bad_data_is_refused(fault: str) -> None:
     assert learner.state is before
 
 
-def test_spec_of_the_task_is_that_of_its_box_whatever_the_data_type() -> None:
+def test_limits_of_the_task_are_float64_for_any_data_type_of_the_box() -> None:
     task = task_of(PointMass())
     assert isinstance(task, TaskSpec)
     assert task.action_low.dtype == np.float64
     np.testing.assert_array_equal(task.action_scale, [1.0])
 
 
-class Painful(SwingUp):
-    """Steps in its own way: the inherited batch form knows nothing of that."""
+class OtherReward(SwingUp):
+    """Has its own step, so that the inherited batch model does not apply."""
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         observation, _, terminated, truncated, info = super().step(action)
         return observation, -12345.0, terminated, truncated, info
 
 
-def test_a_subclass_that_steps_in_its_own_way_is_not_simulated_in_batches() -> None:
-    learner = kreps.KREPS(Painful(), **TINY).learn(1, progress=False)
-    rewards = np.concatenate([r.rewards for r in learner.state.window.rollouts])
-    np.testing.assert_array_equal(rewards, -12345.0)
+def test_a_subclass_with_its_own_step_is_not_simulated_by_the_batch_model() -> None:
+    learner = kreps.KREPS(OtherReward(), **TINY).learn(1, progress=False)
+    np.testing.assert_array_equal(learner.state.window.rollouts.rewards, -12345.0)
     assert batch_model_of(SwingUp()) is SwingUp.batch_model
 
 
-def test_rollouts_that_end_early_count_by_their_weight() -> None:
+# ---- evaluation -------------------------------------------------------------------------------
+
+
+def rewarded(*rewards: float, terminated: bool = False) -> Rollout:
+    steps = len(rewards)
+    return Rollout(np.zeros((steps + 1, 1)), np.zeros((steps, 1)), np.array(rewards), terminated)
+
+
+def test_a_terminated_rollout_counts_by_its_weight() -> None:
     # one step of reward 1, then a restart; a hundred steps of reward 0
-    short = Rollout(np.zeros((2, 1)), np.zeros((1, 1)), np.ones(1), terminated=True)
-    long = Rollout(np.zeros((101, 1)), np.zeros((100, 1)), np.zeros(100))
-    found = discounted_average([short, long], 0.02)
+    found = discounted_average([rewarded(1.0, terminated=True), rewarded(*[0.0] * 100)], 0.02)
     assert found.mean == pytest.approx(1.0 / (1.0 + (1.0 - 0.98**100) / 0.02))
-    alike = discounted_average([long, long, long], 0.02)
-    assert (alike.mean, alike.standard_error) == (0.0, 0.0)
+    assert (found.episodes, found.steps) == (2, 100)
+
+
+def test_the_average_and_its_standard_error_by_hand() -> None:
+    # p = 1/2: weights 1 and 1/2, so that weights of rollouts are 1.5, 1 and 1.5, 4 in all;
+    # weighted rewards are 4 + 0, 1 and 2 + 1, 8 in all
+    found = discounted_average([rewarded(4.0, 0.0), rewarded(1.0), rewarded(2.0, 2.0)], 0.5)
+    assert found.mean == pytest.approx(2.0, rel=1e-12)
+    # weighted rewards less mean times weight are 1, -1 and 0: their variance is 1 (with 2 degrees
+    # of freedom); it is divided by the mean weight, 4/3, and the root of the count
+    assert found.standard_error == pytest.approx(1.0 / (4.0 / 3.0) / 3.0**0.5, rel=1e-12)
+    assert found.standard_error == pytest.approx(0.4330127, rel=1e-6)
+    assert (found.episodes, found.steps) == (3, 2)
+
+
+def test_the_standard_error_does_not_depend_on_an_offset_of_rewards() -> None:
+    rewards = [(4.0, 0.0), (1.0,), (2.0, 2.0)]
+    found = discounted_average([rewarded(*(r + 100.0 for r in each)) for each in rewards], 0.5)
+    assert found.mean == pytest.approx(102.0, rel=1e-12)
+    assert found.standard_error == pytest.approx(0.4330127, rel=1e-6)
+
+
+def test_the_standard_error_falls_with_the_root_of_the_count() -> None:
+    pair = [rewarded(0.0), rewarded(2.0)]  # deviations -1 and 1 from the mean
+    assert discounted_average(pair, 0.02).standard_error == pytest.approx(1.0, rel=1e-12)
+    eight = discounted_average(pair * 4, 0.02)  # sqrt(8 / 7) / sqrt(8)
+    assert eight.standard_error == pytest.approx(0.3779645, rel=1e-6)
+    assert eight.mean == pytest.approx(1.0, rel=1e-12)
+
+
+def test_equal_rollouts_and_a_single_one_have_no_standard_error() -> None:
+    alike = discounted_average([rewarded(1.0, 2.0)] * 3, 0.02)
+    assert alike.standard_error == pytest.approx(0.0, abs=1e-15)
+    alone = discounted_average([rewarded(4.0, 1.0)], 0.5)
+    assert (alone.mean, alone.standard_error) == (3.0, 0.0)
+    assert (alone.episodes, alone.steps) == (1, 2)

@@ -1,4 +1,4 @@
-"""Gaussian process policies on few centres, against the exact process and against textbooks."""
+"""Gaussian process policies on few centres, against the exact process and dense formulas."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.gram import gaussian_gram
 from kreps.kernels.kernel import Kernel, factors_of
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
-from kreps.policies.sparse_gp import TRIANGULAR_BLOCK_ROWS, PolicySums, SparseGP
+from kreps.policies.sparse_gp import PolicySums, SparseGP
 
 TASK = TaskSpec(2, np.array([-1.0, 10.0]), np.array([1.0, 30.0]))
 CENTRE, SCALE = np.array([0.0, 20.0]), np.array([1.0, 10.0])
@@ -72,7 +72,7 @@ def fit(policy: CostSensitiveGP, centres: int, tolerance: float = 0.0) -> Sparse
 # ---- the fit ----------------------------------------------------------------------------------
 
 
-def test_with_all_states_as_centres_it_is_the_exact_process() -> None:
+def test_with_all_states_as_centres_the_process_is_exact() -> None:
     """Up to rounding: K of 30 states has a condition number near 1e5."""
     policy = exact(30, 0)
     few = fit(policy, 30)
@@ -83,7 +83,7 @@ def test_with_all_states_as_centres_it_is_the_exact_process() -> None:
     np.testing.assert_allclose(few.standard_deviation(at), deviation, rtol=1e-8)
 
 
-def test_with_few_centres_it_is_the_projected_process() -> None:
+def test_with_few_centres_the_process_is_projected() -> None:
     policy = exact(120, 2)
     basis, _ = RKHSBasis.fit(KERNEL, policy.states, tolerance=0.0, max_rank=15)
     few, at = fit(policy, 15), np.concatenate([queries(100, 3), FAR])
@@ -94,17 +94,17 @@ def test_with_few_centres_it_is_the_projected_process() -> None:
     np.testing.assert_allclose(few.standard_deviation(at), wanted, rtol=1e-9)
 
 
-def test_far_from_all_data_it_is_the_prior_where_subset_of_regressors_grows_sure() -> None:
+def test_far_from_all_data_the_variance_is_the_priors_unlike_in_subset_of_regressors() -> None:
     policy = exact(120, 4)
     basis, _ = RKHSBasis.fit(KERNEL, policy.states, tolerance=0.0, max_rank=15)
     few = fit(policy, 15)
     prior = np.sqrt(SIGNAL + NOISE) * SCALE
     np.testing.assert_allclose(few.standard_deviation(FAR), [prior, prior], rtol=1e-12)
     np.testing.assert_allclose(few.greedy(FAR), [CENTRE, CENTRE], atol=1e-12)
-    # what would come out without the first part: the noise alone, where nothing is known
+    # without the part that the centres cannot represent, only the noise would be left
     _, _, regressors = projected(policy, basis, FAR)
     np.testing.assert_allclose(regressors, NOISE, rtol=1e-12)
-    # already at three lengthscales from the data it is the smaller by far
+    # three lengthscales from the data it is already far smaller
     near = np.array([[3.0 * 0.8 + np.abs(policy.states[:, 0]).max(), 0.0]])
     _, variance, regressors = projected(policy, basis, near)
     assert regressors[0] < 0.3 * variance[0]
@@ -128,7 +128,7 @@ def test_a_sample_of_weight_three_counts_as_three_samples() -> None:
 # ---- sums -------------------------------------------------------------------------------------
 
 
-def test_sums_are_those_of_their_definition() -> None:
+def test_policy_sums_follow_their_definition() -> None:
     rng = np.random.default_rng(8)
     z, w, u = rng.normal(size=(30, 4)), rng.uniform(0.1, 2.0, 30), rng.normal(size=(30, 2))
     sums = PolicySums.from_samples(z, w, u)
@@ -166,7 +166,7 @@ def test_sums_add_up_over_chunks(cuts: list[int]) -> None:
 
 
 @pytest.mark.parametrize("centres", [1, 3, 10, 30, 100])
-def test_a_compressed_policy_is_between_noise_and_prior_everywhere(centres: int) -> None:
+def test_the_variance_of_a_compressed_policy_is_between_noise_and_prior(centres: int) -> None:
     few = exact(150, 11).compressed(centres)
     assert len(few.states) <= centres
     at = np.concatenate([few.states, queries(500, 12), FAR])
@@ -175,8 +175,8 @@ def test_a_compressed_policy_is_between_noise_and_prior_everywhere(centres: int)
     assert (scaled <= np.sqrt(SIGNAL + NOISE) * (1 + 1e-12)).all()
 
 
-def test_a_compressed_policy_comes_the_closer_the_more_centres_it_has() -> None:
-    """What 5 centres cannot say is a large part of the action scale; 80 say it to a thousandth."""
+def test_a_compressed_policy_converges_with_the_number_of_centres() -> None:
+    """With 5 centres the error is a large part of the action scale, with 80 a thousandth of it."""
     policy, at = exact(200, 13), queries(300, 14)
     at = at[np.abs(at).max(axis=1) < 2.0]
     mean, deviation = posterior(policy, at)
@@ -204,7 +204,7 @@ def test_a_policy_is_not_compressed_to_more_centres_than_it_has_samples(centres:
     np.testing.assert_allclose(few.standard_deviation(at), deviation, rtol=1e-5)
 
 
-def test_centres_are_samples_and_each_only_once() -> None:
+def test_centres_are_distinct_samples() -> None:
     policy = exact(20, 17)
     twice = CostSensitiveGP(
         TASK,
@@ -222,12 +222,12 @@ def test_centres_are_samples_and_each_only_once() -> None:
 
 
 @pytest.mark.parametrize("centres", [0, -1])
-def test_no_centres_at_all_are_refused(centres: int) -> None:
+def test_fewer_than_one_centre_is_rejected(centres: int) -> None:
     with pytest.raises(ConfigurationError, match=f"centres = {centres}"):
         exact(10, 18).compressed(centres)
 
 
-def test_one_centre_is_a_policy() -> None:
+def test_one_centre_is_enough_for_a_policy() -> None:
     few = exact(50, 19).compressed(1)
     assert few.greedy(queries(5, 20)).shape == (5, 2)
     assert len(few.states) == 1
@@ -248,19 +248,19 @@ def test_kernel_values_are_those_of_gaussian_gram() -> None:
     few = exact(60, 24).compressed(30)
     for at in (queries(1, 25), queries(40, 26), FAR, few.states):
         wanted = gaussian_gram(KERNEL.embed(few.states), KERNEL.embed(at))
-        # gaussian_gram takes care of rounding in another way
+        # gaussian_gram reduces rounding in another way
         np.testing.assert_allclose(few._covariances(at), wanted, rtol=0, atol=1e-13)
 
 
-def test_a_triangular_matrix_is_multiplied_in_pieces_that_give_the_same() -> None:
-    """Where the kernel is so rough that every support point is a centre."""
-    count = 2 * TRIANGULAR_BLOCK_ROWS + 17
+def test_a_triangular_matrix_is_multiplied_in_blocks_with_the_same_result() -> None:
+    """Lengthscales are so short that every support point is a centre."""
+    count = 273
     rough = exact(count, 27, KERNEL.with_lengthscales(np.array([0.02, 0.02])))
     few = rough.predictor
     assert len(few.states) == count
     assert [rows.shape for rows in few._explained_blocks] == [
-        (TRIANGULAR_BLOCK_ROWS, TRIANGULAR_BLOCK_ROWS),
-        (TRIANGULAR_BLOCK_ROWS, 2 * TRIANGULAR_BLOCK_ROWS),
+        (128, 128),
+        (128, 256),
         (17, count),
     ]
     at = np.concatenate([rough.states, queries(20, 28)])
@@ -272,11 +272,7 @@ def test_a_triangular_matrix_is_multiplied_in_pieces_that_give_the_same() -> Non
         )
 
 
-def test_a_full_matrix_is_multiplied_whole() -> None:
-    few = exact(
-        2 * TRIANGULAR_BLOCK_ROWS, 29, KERNEL.with_lengthscales(np.array([0.1, 0.1]))
-    ).compressed(TRIANGULAR_BLOCK_ROWS + 9)
-    assert len(few.states) == TRIANGULAR_BLOCK_ROWS + 9
-    assert [rows.shape for rows in few._explained_blocks] == [
-        (TRIANGULAR_BLOCK_ROWS + 9, TRIANGULAR_BLOCK_ROWS + 9)
-    ]
+def test_a_full_matrix_is_multiplied_at_once() -> None:
+    few = exact(256, 29, KERNEL.with_lengthscales(np.array([0.1, 0.1]))).compressed(137)
+    assert len(few.states) == 137
+    assert [rows.shape for rows in few._explained_blocks] == [(137, 137)]

@@ -1,4 +1,4 @@
-"""The reaching task and the image swing-up: both forms, physics, pictures, and what is learnt."""
+"""The reaching task and the image swing-up: environments, batch models, physics, learning."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_gymnasium_checker_finds_nothing_of_substance(name: str) -> None:
+def test_gymnasium_checker_has_no_substantial_warning(name: str) -> None:
     env = gym.make(name, render_mode="rgb_array")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        # unbounded velocities are what these tasks have
+        # velocities of these tasks are unbounded
         warnings.filterwarnings("ignore", message=".*infinity.*")
         warnings.filterwarnings("ignore", message=".*symmetric and normalized.*")
         warnings.filterwarnings("ignore", message=".*different from the unwrapped version.*")
@@ -66,7 +66,7 @@ def test_batch_and_environment_give_the_same_trajectories(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_pictures_follow_the_state(name: str) -> None:
+def test_pictures_depend_on_the_state(name: str) -> None:
     env = gym.make(name, render_mode="rgb_array").unwrapped
     env.reset(seed=0)
     first: Any = env.render()
@@ -82,7 +82,7 @@ def test_pictures_follow_the_state(name: str) -> None:
 
 
 def kinetic_energy(state: FloatArray) -> FloatArray:
-    """Of the two rods, from the velocities of their centres: shares nothing with the task."""
+    """Kinetic energy (m,) of the two rods, from the velocities of their centres."""
     upper, fore = state[:, 0], state[:, 0] + state[:, 1]
     w1, w2 = state[:, 2], state[:, 2] + state[:, 3]
     length, mass = reaching.LINK, reaching.MASS
@@ -100,7 +100,7 @@ def coast(state: FloatArray, torque: FloatArray, steps: int) -> FloatArray:
     return state
 
 
-def test_the_arm_keeps_its_energy_and_angular_momentum_without_torque() -> None:
+def test_energy_of_the_arm_is_conserved_without_torque() -> None:
     rng = np.random.default_rng(1)
     start = np.concatenate([rng.uniform(-3, 3, (6, 2)), rng.uniform(-4, 4, (6, 2))], axis=1)
     end = coast(start, np.zeros((6, 2)), 40)
@@ -108,7 +108,7 @@ def test_the_arm_keeps_its_energy_and_angular_momentum_without_torque() -> None:
     assert np.abs(end[:, 2:] - start[:, 2:]).max() > 0.5
 
 
-def test_the_arm_gains_the_energy_that_the_torques_put_in() -> None:
+def test_power_of_the_arm_is_that_of_the_torques() -> None:
     h, torque = 1e-5, np.array([[1.3, -0.7]])
     state = np.array([[0.4, 1.1, 0.8, -0.5]])
     moved = state + h * np.concatenate([state[:, 2:], reaching.accelerations(state, torque)], 1)
@@ -116,7 +116,7 @@ def test_the_arm_gains_the_energy_that_the_torques_put_in() -> None:
     np.testing.assert_allclose(power, torque[0] @ state[0, 2:], rtol=1e-3)
 
 
-def test_the_arm_starts_stretched_upwards_and_pays_for_distance_and_torque() -> None:
+def test_the_arm_starts_stretched_upwards_and_its_cost_is_of_distance_and_torque() -> None:
     start = np.array([reaching.START])
     np.testing.assert_allclose(reaching.end_effector(start), [[0.0, 1.0]], atol=1e-12)
     np.testing.assert_allclose(reaching.reward(start, np.array([[3.0, 4.0]])), -1.25 - 25e-4)
@@ -125,7 +125,7 @@ def test_the_arm_starts_stretched_upwards_and_pays_for_distance_and_torque() -> 
     np.testing.assert_allclose(reaching.reward(folded, np.zeros((1, 2))), 0.0, atol=1e-20)
 
 
-def test_torques_beyond_the_limit_act_and_cost_as_the_limit() -> None:
+def test_torques_beyond_the_limit_have_the_effect_and_cost_of_the_limit() -> None:
     model, start = reaching.ReachingBatch(), np.array([reaching.START])
     beyond, at = (
         model.step(start, np.array([torques]), [None])  # type: ignore[list-item]
@@ -154,7 +154,7 @@ def test_reference_value_of_random_torques() -> None:
 # ---- images -----------------------------------------------------------------------------------
 
 
-def test_an_image_shows_the_rod_where_it_is() -> None:
+def test_an_image_is_brightest_at_the_rod() -> None:
     def brightest(theta: float) -> FloatArray:
         picture = image(np.array([theta])).reshape(PIXELS, PIXELS)
         rows, columns = np.nonzero(picture > 0.9 * picture.max())
@@ -190,18 +190,18 @@ def test_the_difference_image_is_the_change_since_the_previous_step() -> None:
         before = after
 
 
-def test_the_pendulum_behind_the_camera_is_that_of_the_swing_up() -> None:
-    seen, hidden = ImageSwingUpBatch(), SwingUpBatch()
+def test_dynamics_of_the_image_swing_up_are_those_of_the_swing_up() -> None:
+    images, states = ImageSwingUpBatch(), SwingUpBatch()
     one, other = [np.random.default_rng(5)], [np.random.default_rng(5)]
-    a, b = seen.initial(one), hidden.initial(other)
+    a, b = images.initial(one), states.initial(other)
     for torque in (30.0, -30.0, 12.0, 0.0):
-        a, reward_a, _ = seen.step(a, np.array([[torque]]), one)
-        b, reward_b, _ = hidden.step(b, np.array([[torque]]), other)
+        a, reward_a, _ = images.step(a, np.array([[torque]]), one)
+        b, reward_b, _ = states.step(b, np.array([[torque]]), other)
         np.testing.assert_array_equal(a[:, :2], b)
         assert reward_a == reward_b
 
 
-def test_the_learner_sees_pixels_only_with_one_lengthscale_per_image() -> None:
+def test_observations_are_pixels_with_one_lengthscale_per_image() -> None:
     env = gym.make("kreps/ImageSwingUp-v0")
     task = task_of(env)
     assert task.observation_size == 2 * PIXELS**2
@@ -214,7 +214,7 @@ def test_the_learner_sees_pixels_only_with_one_lengthscale_per_image() -> None:
     assert policy.kernel.lengthscales.shape == (2,)
 
 
-def test_images_survive_a_checkpoint(tmp_path: Any) -> None:
+def test_a_learner_from_images_resumes_with_the_same_bytes(tmp_path: Any) -> None:
     env = gym.make("kreps/ImageSwingUp-v0")
     whole = kreps.KREPS(env, seed=1, **TINY).learn(2, progress=False)
     half = kreps.KREPS(env, seed=1, **TINY).learn(1, progress=False)
@@ -228,7 +228,7 @@ def test_images_survive_a_checkpoint(tmp_path: Any) -> None:
 # ---- groups of coordinates --------------------------------------------------------------------
 
 
-def test_groups_share_a_lengthscale_and_others_have_their_own() -> None:
+def test_coordinates_of_a_group_share_a_lengthscale() -> None:
     task = kreps.TaskSpec(5, [-1.0], [1.0], periodic=(0,), groups=((2, 4),))
     assert task.state_factors == (
         Periodic((0,)),
@@ -248,15 +248,15 @@ def test_groups_share_a_lengthscale_and_others_have_their_own() -> None:
         (("ab",), "whole number"),
     ],
 )
-def test_impossible_groups_are_refused(groups: Any, says: str) -> None:
+def test_invalid_groups_raise(groups: Any, says: str) -> None:
     with pytest.raises(ConfigurationError, match=says):
         kreps.TaskSpec(3, [-1.0], [1.0], periodic=(0,), groups=groups)
 
 
-def test_a_grid_over_images_is_refused_with_a_remedy() -> None:
+def test_a_grid_over_images_raises_with_a_remedy() -> None:
     env = gym.make("kreps/ImageSwingUp-v0")
-    with pytest.raises(ConfigurationError, match="rkhs"):
-        kreps.KREPS(env, features="grid", **TINY).learn(1, progress=False)
+    with pytest.raises(ConfigurationError, match="RKHS"):
+        kreps.KREPS(env, value=kreps.Grid(), **TINY).learn(1, progress=False)
 
 
 def test_rollouts_in_batches_and_step_by_step_agree() -> None:
@@ -267,7 +267,7 @@ def test_rollouts_in_batches_and_step_by_step_agree() -> None:
         def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
             return 3.0 * noise
 
-    def rollouts(form: gym.Env[Any, Any]) -> list[kreps.Rollout]:
+    def rollouts(form: gym.Env[Any, Any]) -> kreps.Rollouts:
         rng = np.random.default_rng(0)
         noises = [rng.standard_normal((length, 2)) for length in (7, 3, 9)]
         return simulate(form, task, Noise(), [1, 2, 3], noises)

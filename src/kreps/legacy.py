@@ -223,6 +223,8 @@ def _present_checkpoint(tensors: Tensors, header: Header) -> tuple[Tensors, Head
         "value": (_tree(new, "value") or {}) if has_value else None,
         **{f"{name}_start": _tree(new, f"{name}_start") for name in _STARTS},
     }
+    if not isinstance(header["settings"], dict):
+        raise StorageError(f"its settings are {header['settings']!r:.40}, not named values")
     settings = checkpoint_settings(header["settings"], str(method))
     kept = {name: header[name] for name in ("task", "seed")}
     return new, {**kept, "method": method, "settings": settings, "state": state, "notes": notes}

@@ -145,7 +145,10 @@ def _with_field(section: Any, name: str, part: str, value: Any) -> Any:
     names = [each.name for each in fields(section)] if is_dataclass(section) else []
     if part not in names:
         raise ConfigurationError(_unknown(name, value, [f"{owner}.{each}" for each in names]))
-    return replace(section, **{part: value})
+    try:
+        return replace(section, **{part: value})
+    except ConfigurationError as error:  # begins with the name of the field
+        raise ConfigurationError(f"{owner}.{error}") from error
 
 
 def _unknown(name: str, value: Any, known: list[str]) -> str:

@@ -31,20 +31,26 @@ def wrap_angle(theta: FloatArray) -> FloatArray:
     return (theta + 0.5 * np.pi) % (2.0 * np.pi) - 0.5 * np.pi
 
 
-def acceleration(theta: FloatArray, velocity: FloatArray, torque: FloatArray) -> FloatArray:
+def acceleration(
+    theta: FloatArray, velocity: FloatArray, torque: FloatArray, friction: float = FRICTION
+) -> FloatArray:
     """``theta''`` from ``I theta'' = G sin theta + u - k theta'``, in rad s^-2."""
-    return (WEIGHT_TORQUE * np.sin(theta) + torque - FRICTION * velocity) / INERTIA
+    return (WEIGHT_TORQUE * np.sin(theta) + torque - friction * velocity) / INERTIA
 
 
 def integrate(
-    theta: FloatArray, velocity: FloatArray, torque: FloatArray
+    theta: FloatArray,
+    velocity: FloatArray,
+    torque: FloatArray,
+    friction: float = FRICTION,
+    sub_steps: int = SUB_STEPS,
 ) -> tuple[FloatArray, FloatArray]:
-    """Angle and velocity after one time step of constant torque (Runge-Kutta of order four)."""
+    """Angle and velocity (m,) after one control period of constant torque (m,)."""
 
     def derivative(state: FloatArray) -> FloatArray:
-        return np.stack([state[1], acceleration(state[0], state[1], torque)])
+        return np.stack([state[1], acceleration(state[0], state[1], torque, friction)])
 
-    theta, velocity = runge_kutta(derivative, np.stack([theta, velocity]), TIME_STEP, SUB_STEPS)
+    theta, velocity = runge_kutta(derivative, np.stack([theta, velocity]), TIME_STEP, sub_steps)
     return theta, velocity
 
 

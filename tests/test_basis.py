@@ -1,4 +1,4 @@
-"""Eq. 3: features of V from an RKHS basis and from a fixed grid."""
+"""Features of V (Eq. 3) from an RKHS basis and from a fixed grid."""
 
 from __future__ import annotations
 
@@ -31,13 +31,13 @@ def test_inner_products_of_features_reproduce_the_kernel(tolerance: float) -> No
     assert np.median(np.abs(gram - new @ new.T)) <= tolerance
 
 
-def test_features_at_the_points_are_those_that_were_fitted() -> None:
+def test_features_at_the_points_equal_those_that_fit_returns() -> None:
     points = states(250, 2)
     basis, features = RKHSBasis.fit(KERNEL, points, tolerance=1e-6, max_rank=400)
     np.testing.assert_allclose(basis.features(points), features, atol=1e-9)
 
 
-def test_the_rank_is_capped_and_the_residual_says_what_is_missing() -> None:
+def test_the_rank_is_limited_and_the_residual_is_reported() -> None:
     points = states(250, 3)
     basis, features = RKHSBasis.fit(KERNEL, points, tolerance=1e-6, max_rank=10)
     assert features.shape == (250, 10)
@@ -100,7 +100,7 @@ def test_a_grid_of_radial_basis_functions() -> None:
     np.testing.assert_allclose(grid.function(theta)(new), wanted @ theta, atol=1e-12)
 
 
-def test_a_grid_over_data_has_its_lengthscale_for_spacing() -> None:
+def test_the_lengthscale_of_a_grid_is_its_spacing() -> None:
     points = np.array([[0.3, -2.0], [5.0, 1.0], [-4.0, 4.0]])
     grid, features = RBFGrid.from_points(factors_of(2, periodic=(0,)), points, 4)
     assert features.shape == (3, 16)
@@ -127,7 +127,7 @@ def test_a_grid_of_any_size_covers_the_data(size: int, periodic: tuple[int, ...]
     assert features.max(axis=1).min() > 0.1  # no point is far from all centres
 
 
-def test_a_coordinate_without_range_does_not_spoil_the_grid() -> None:
+def test_a_constant_coordinate_gets_lengthscale_one_in_a_grid() -> None:
     points = np.column_stack([np.full(9, 0.7), np.linspace(0.0, 1.0, 9)])
     grid, features = RBFGrid.from_points(factors_of(2), points, 3)
     assert np.isfinite(features).all()
@@ -135,7 +135,7 @@ def test_a_coordinate_without_range_does_not_spoil_the_grid() -> None:
     np.testing.assert_allclose(grid.kernel.lengthscales, [1.0, 0.5])
 
 
-def test_a_grid_too_large_to_solve_is_refused() -> None:
+def test_a_grid_with_too_many_centres_is_rejected() -> None:
     with pytest.raises(ConfigurationError, match=r"9\^4 centres, but at most 4096.*kreps\.RKHS"):
         RBFGrid.from_points(factors_of(4), np.random.default_rng(14).normal(size=(5, 4)), 9)
 
@@ -161,6 +161,6 @@ def test_a_function_is_the_product_of_features_and_theta(
 
 
 @pytest.mark.parametrize("name", ["pivoted", "grid"])
-def test_no_states_have_no_features(name: str) -> None:
+def test_an_empty_array_of_states_has_an_empty_array_of_features(name: str) -> None:
     # A chunk in which all samples have weight zero passes no states.
     assert bases(states(80, 25))[name].features(np.empty((0, 2))).shape == (0, 16)

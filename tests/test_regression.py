@@ -1,4 +1,4 @@
-"""Eq. 4 against brute force, and against the truth of a small stochastic system."""
+"""Conditional embeddings (Eq. 4) against dense solves, refits, and a system with known moments."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_expected_features_are_the_combination_with_those_strengths(regulariser:
     np.testing.assert_allclose(model.expected_features(successors), combined, atol=1e-9)
 
 
-def test_expected_features_equal_brute_force() -> None:
+def test_expected_features_equal_a_dense_solve() -> None:
     model, successors = fitted(60, 3, 0.05)
     k = model.kernel.gram(model.inputs)
     wanted = k @ np.linalg.inv(k + 0.05 * np.eye(60)) @ successors
@@ -56,14 +56,14 @@ def test_expected_features_equal_brute_force() -> None:
     assert model.factor.jitter == 0.0
 
 
-def test_expected_features_leave_the_observed_ones_alone() -> None:
+def test_expected_features_does_not_change_its_argument() -> None:
     model, successors = fitted(20, 4, 0.1)
     before = successors.copy()
     model.expected_features(successors)
     np.testing.assert_array_equal(successors, before)
 
 
-def test_one_sample_is_shrunk_by_the_regulariser() -> None:
+def test_the_regulariser_shrinks_a_single_sample() -> None:
     kernel = Kernel(factors_of(1), np.array([1.0]))
     model = KernelEmbedding.fit(kernel, np.array([[0.0]]), 0.25)
     found = model.expected_features(np.array([[2.0, -1.0]]))
@@ -77,7 +77,7 @@ def test_duplicated_inputs_share_the_mean_of_their_successors() -> None:
     np.testing.assert_allclose(found, 3.0, rtol=1e-5)
 
 
-def test_the_sample_model_answers_with_what_was_observed() -> None:
+def test_the_sample_model_returns_the_observed_features() -> None:
     successors = np.random.default_rng(5).normal(size=(9, 4))
     np.testing.assert_array_equal(SampleModel().expected_features(successors), successors)
 
@@ -94,7 +94,7 @@ def test_the_conditional_expectation_is_learnt_from_noisy_successors() -> None:
         truth = np.column_stack([mean, mean**2 + 0.25])
         inputs = np.column_stack([s, a])
         model = KernelEmbedding.fit(Kernel(factors_of(2), np.array([0.6, 1.0])), inputs, 0.5)
-        # New inputs well inside the data, where the truth is in reach.
+        # New inputs well inside the data.
         query = np.column_stack([rng.uniform(-1.5, 1.5, 200), rng.uniform(-0.8, 0.8, 200)])
         there = np.sin(2.0 * query[:, 0]) + query[:, 1]
         predicted = model.strengths(query).T @ observed
@@ -104,10 +104,10 @@ def test_the_conditional_expectation_is_learnt_from_noisy_successors() -> None:
             float(np.mean((SampleModel().expected_features(observed) - truth) ** 2)),
         )
 
-    few, some, many = errors(40), errors(200), errors(1000)
-    # Measured: 0.43, 0.12, 0.026 at the samples; the observed successors stay at the noise.
-    assert few[0] > 2.0 * some[0] > 4.0 * many[0]
-    assert few[1] > 2.0 * some[1] > 4.0 * many[1]
+    few, several, many = errors(40), errors(200), errors(1000)
+    # Measured: 0.43, 0.12, 0.026 at the samples.  That of observed successors stays at the noise.
+    assert few[0] > 2.0 * several[0] > 4.0 * many[0]
+    assert few[1] > 2.0 * several[1] > 4.0 * many[1]
     assert many[0] < 0.1 * many[2]
 
 
@@ -128,7 +128,7 @@ def test_leave_one_out_errors_are_those_of_refits(regulariser: float) -> None:
     assert found.relative == pytest.approx(np.sqrt(squares.sum() / np.sum(targets**2)))
 
 
-def test_the_relative_error_of_a_model_that_says_nothing_is_one() -> None:
+def test_predicting_zero_has_a_relative_error_of_one() -> None:
     targets = np.random.default_rng(15).normal(size=(7, 3))
     assert LeaveOneOut(targets, targets).relative == pytest.approx(1.0)
     assert LeaveOneOut(targets, np.zeros((7, 3))).relative == 0.0
@@ -140,14 +140,14 @@ def test_the_relative_error_of_a_model_that_says_nothing_is_one() -> None:
 
 
 @pytest.mark.parametrize("regulariser", [1e-3, 1.0])
-def test_the_predictor_goes_on_from_what_is_expected_at_the_samples(regulariser: float) -> None:
+def test_the_predictor_extends_the_expectation_at_the_samples(regulariser: float) -> None:
     model, targets = fitted(40, 16, regulariser)
     predict = model.predictor(targets)
     np.testing.assert_allclose(predict(model.inputs), model.expected_features(targets), atol=1e-9)
     queries = np.random.default_rng(17).normal(size=(9, 3))
     np.testing.assert_allclose(predict(queries), model.strengths(queries).T @ targets, atol=1e-9)
     far = np.array([[0.0, 80.0, 0.0]])
-    np.testing.assert_array_equal(predict(far), np.zeros((1, 6)))  # it fades to its origin
+    np.testing.assert_array_equal(predict(far), np.zeros((1, 6)))  # the prediction tends to zero
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 30])
@@ -159,7 +159,7 @@ def test_predictions_in_batches_are_those_at_once(count: int) -> None:
     np.testing.assert_allclose(found, model.strengths(queries).T @ targets, atol=1e-9)
 
 
-# In features of states and actions
+# ---- in features of states and actions --------------------------------------------------------
 
 
 @pytest.mark.parametrize("copies", [1, 4])
@@ -167,7 +167,7 @@ def test_predictions_in_batches_are_those_at_once(count: int) -> None:
 def test_leave_one_out_errors_of_a_regression_are_those_of_refits(
     regulariser: float, copies: int
 ) -> None:
-    """Of samples that stand for ``copies`` each, one of which is left out."""
+    """Each row stands for ``copies`` samples, one of which is left out."""
     rng = np.random.default_rng(18)
     psi, targets = rng.normal(size=(20, 6)), rng.normal(size=(20, 3))
     wanted = []
@@ -196,7 +196,7 @@ def test_regression_on_all_features_is_the_kernel_embedding(regulariser: float) 
     sums = RegressionSums.from_samples(basis.features(model.inputs), successors)
     found = FeatureRegression.fit(basis, sums, regulariser)
     assert found.jitter == 0.0
-    # The condition of K + lambda I, up to 1e4, takes that many digits.
+    # K + lambda I has a condition number of up to 1e4, which costs four digits.
     np.testing.assert_allclose(
         found.mean(model.inputs), model.expected_features(successors), atol=1e-8
     )
@@ -217,7 +217,7 @@ def test_regression_on_few_features_is_the_embedding_of_their_kernel() -> None:
 
 
 @pytest.mark.parametrize("cuts", [[20], [1, 2, 39]])
-def test_what_chunks_say_of_the_embedding_adds_up(cuts: list[int]) -> None:
+def test_regression_sums_of_chunks_add_up(cuts: list[int]) -> None:
     rng = np.random.default_rng(12)
     psi, targets = rng.normal(size=(40, 5)), rng.normal(size=(40, 3))
     whole = RegressionSums.from_samples(psi, targets)
@@ -229,7 +229,7 @@ def test_what_chunks_say_of_the_embedding_adds_up(cuts: list[int]) -> None:
     np.testing.assert_allclose(added.product, whole.product, rtol=1e-12, atol=1e-13)
 
 
-def test_duplicated_inputs_are_regressed_on_without_harm() -> None:
+def test_a_regression_on_duplicated_inputs_is_solvable() -> None:
     kernel = Kernel(factors_of(1), np.array([1.0]))
     basis, _ = RKHSBasis.fit(kernel, np.zeros((4, 1)), tolerance=1e-6, max_rank=4)
     targets = np.array([[0.0], [2.0], [4.0], [6.0]])
@@ -239,7 +239,7 @@ def test_duplicated_inputs_are_regressed_on_without_harm() -> None:
 
 
 @pytest.mark.parametrize("regulariser", [1e-4, 1e-2, 1.0])
-def test_few_pivots_say_what_all_samples_say(regulariser: float) -> None:
+def test_a_pivoted_embedding_predicts_what_the_full_one_predicts(regulariser: float) -> None:
     rng = np.random.default_rng(4)
     inputs = rng.uniform(-1.0, 1.0, size=(300, 2))
     targets = np.column_stack([np.sin(3.0 * inputs[:, 0]), inputs[:, 1] ** 2])
@@ -252,12 +252,12 @@ def test_few_pivots_say_what_all_samples_say(regulariser: float) -> None:
     assert loo_residuals.max() < 1.001 * 1e-4 * regulariser
     np.testing.assert_allclose(few.basis.features(inputs), few.features, atol=1e-8)
     elsewhere = rng.uniform(-1.0, 1.0, size=(50, 2))
-    said, wanted = (model.predictor(targets)(elsewhere) for model in (few, exact))
-    np.testing.assert_allclose(said, wanted, atol=1e-3)
+    predicted, wanted = (model.predictor(targets)(elsewhere) for model in (few, exact))
+    np.testing.assert_allclose(predicted, wanted, atol=1e-3)
     found, errors = (model.leave_one_out(targets).errors for model in (few, exact))
     np.testing.assert_allclose(found, errors, atol=1e-3)
 
 
-def test_where_no_two_samples_are_alike_few_pivots_do_not_suffice() -> None:
+def test_dissimilar_samples_have_no_pivoted_embedding() -> None:
     kernel = Kernel((SquaredExponential((0,)),), np.array([0.1]))
     assert PivotedEmbedding.fit(kernel, np.arange(20.0)[:, None], 0.1) is None
