@@ -1,42 +1,42 @@
-# Two commands on a fresh machine: `make demo` and `make test`.  The rest is for developers.
+# For users: `make demo` and `make test`.  The other targets are for developers.
 
 PYTHON ?= python3
 BIN := .venv/bin
 
 .PHONY: demo test check bench format clean constraints tables
 
-demo: .venv/installed           ## learn the swing-up; pictures and policy in runs/demo
+demo: .venv/installed           ## learn the swing-up; writes pictures and policy to runs/demo
 	rm -rf runs/demo
 	$(BIN)/kreps train kreps/SwingUp-v0 --iterations 20 --seed 0 --out runs/demo
 
-test: .venv/installed           ## all tests, in under ten minutes on two cores
+test: .venv/installed           ## all tests
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
-check: .venv/installed          ## formatter, linter, types, imports
+check: .venv/installed          ## formatter, linter, types, import contracts
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
-bench: .venv/installed          ## speed against the machine's own peak, to results/benchmarks.md
+bench: .venv/installed          ## benchmarks of speed; writes results/benchmarks.md
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --record=results
 
 format: .venv/installed
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-# The exact versions of constraints.txt, checked by hash.
+# Installs the exact versions of constraints.txt, checked by hash.
 .venv/installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r constraints.txt
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 	touch $@
 
-constraints:                    ## renew constraints.txt (needs uv)
+constraints:                    ## update constraints.txt (needs uv)
 	uv pip compile pyproject.toml --extra dev --extra bench --universal --generate-hashes \
 	  --no-annotate --no-header --upgrade --quiet -o constraints.txt
 
-tables:                         ## write the tables of results/ into the pages that show them
+tables:                         ## write the tables of results/ into the documentation pages
 	$(PYTHON) docs/fill_tables.py
 
 clean:

@@ -1,4 +1,4 @@
-"""Newton's method on the dual of the bounded update."""
+"""Newton's method on the dual of the KL-bounded update."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from kreps.algorithms.reps import stationarity_ridge
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import RKHSBasis
 from kreps.models.transition import feature_differences, state_kernel, successor_features
-from kreps.settings import PRESETS
+from kreps.presets import SINGLE_STEP
 
 
 class Counting(DualProblem):
-    """Counts the Hessians that a solve asks for."""
+    """A dual problem that counts the Hessians computed."""
 
-    asked = 0
+    hessians = 0
 
     def moments(self, eta: float, theta: FloatArray, *, with_covariance: bool) -> Moments:
-        Counting.asked += with_covariance
+        Counting.hessians += with_covariance
         return super().moments(eta, theta, with_covariance=with_covariance)
 
 
 def hessians(problem: DualProblem) -> int:
-    """How many a solve of the problem needs."""
-    Counting.asked = 0
+    """Number of Hessians that solving the problem takes."""
+    Counting.hessians = 0
     assert solve_dual(Counting(**vars(problem))).converged
-    return Counting.asked
+    return Counting.hessians
 
 
 @pytest.mark.parametrize("n", [1500, 3000])
 def bench_newton_iteration(measure: Measure, n: int) -> None:
-    """As many features as samples; the time of a whole solve counts all its iterations."""
+    """As many features as samples; all iterations of a solve are timed."""
     rng = np.random.default_rng(n)
     rewards, _ = standardise(rng.standard_normal(n))
     problem = DualProblem(rewards, rng.standard_normal((n, n)), 0.5, 100.0, 1e-6)
@@ -52,9 +52,9 @@ def bench_newton_iteration(measure: Measure, n: int) -> None:
 
 
 def bench_newton_solve(measure: Measure) -> None:
-    """From a cold start, on features and rewards of the swing-up."""
-    data = swing_up(1500)
-    learner, transitions, observed = data.learner, data.transitions, PRESETS["observed"]
+    """Without a start value, on features and rewards of the swing-up."""
+    data, settings = swing_up(1500), SINGLE_STEP
+    learner, transitions = data.learner, data.transitions
     kernel = state_kernel(transitions, learner.task, np.random.default_rng(0))
     basis, features = RKHSBasis.fit(kernel, transitions.points, tolerance=0.0, max_rank=300)
     assert features.shape[1] == 300, basis.residual
@@ -67,9 +67,9 @@ def bench_newton_solve(measure: Measure) -> None:
             features[transitions.start].mean(axis=0),
             0.02,
         ),
-        observed.kl_bound,
-        stationarity_ridge(observed, None) / len(rewards),
-        observed.eta_floor,
+        settings.kl_bound,
+        stationarity_ridge(settings, None) / len(rewards),
+        settings.eta_floor,
     )
     count = hessians(problem)
     measured = measure(

@@ -1,4 +1,4 @@
-"""The conditional embedding, and the fits of hyper-parameters."""
+"""The conditional embedding, and the fits of its and the policy's hyper-parameters."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from criteria import Seconds, Share
 from data import swing_up
 from measuring import Measure
 
-from kreps.algorithms.reps import PolicyTargets, policy_hyperparameters, value_basis
+from kreps.algorithms.policy_targets import PolicyTargets, policy_hyperparameters
+from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.hyperparameters import EmbeddingLoss, PolicyLoss, factor_distances
 from kreps.kernels.kernel import Kernel, SquaredExponential, median_lengthscales
 from kreps.kernels.regression import KernelEmbedding
@@ -20,14 +21,16 @@ RNG = np.random.default_rng
 
 
 class Prepared:
-    """What the stages before would hand on."""
+    """The input of each stage, computed as by the stages before it."""
 
     def __init__(self) -> None:
         data = swing_up(N)
-        self.task, self.settings = data.learner.task, data.learner.settings
+        self.task = data.learner.task
         self.transitions = data.transitions
         self.kernel = state_kernel(self.transitions, self.task, RNG(0))
-        _, features = value_basis(self.transitions, self.kernel, self.settings)
+        _, features = RKHSBasis.fit(
+            self.kernel, self.transitions.points, tolerance=1e-6, max_rank=400
+        )
         self.successors = successor_features(self.transitions, features)
         self.changes = self.successors - features[self.transitions.state]
         actions = self.task.scaled_applied(self.transitions.actions)
@@ -35,7 +38,7 @@ class Prepared:
         factors = (*self.kernel.factors, SquaredExponential((self.inputs.shape[1] - 1,)))
         self.input_kernel = Kernel(factors, median_lengthscales(factors, self.inputs, RNG(1)))
         p = RNG(2).uniform(0.2, 1.0, N)
-        self.samples = PolicyTargets.of(self.transitions, p / p.sum(), self.task)
+        self.samples = PolicyTargets.from_samples(self.transitions, p / p.sum(), self.task)
 
 
 def bench_embedding(measure: Measure) -> None:
@@ -71,6 +74,7 @@ def bench_policy_loss(measure: Measure) -> None:
         factor_distances(p.kernel.factors, p.samples.states[rows]),
         p.samples.targets[rows],
         p.samples.weights[rows],
+        p.samples.target_variance[rows],
     )
     x = np.append(np.log(p.kernel.lengthscales), np.log([1.0, 0.3]))
     measure(
@@ -85,7 +89,7 @@ def bench_embedding_fit(measure: Measure) -> None:
     p = Prepared()
     measure(
         "fit of the embedding, cold start",
-        f"n = {N}, of which {FIT_SAMPLE_SIZE} searched",
+        f"n = {N}, {FIT_SAMPLE_SIZE} of them in the fit",
         lambda: fit_embedding(p.transitions, p.changes, p.kernel, p.task, None, RNG(3)),
         Seconds(),
     )
@@ -95,7 +99,7 @@ def bench_policy_fit(measure: Measure) -> None:
     p = Prepared()
     measure(
         "hyper-parameters of the policy, cold start",
-        f"n = {N}, of which {FIT_SAMPLE_SIZE} searched",
-        lambda: policy_hyperparameters(p.samples, p.kernel, p.settings, None, RNG(3)),
+        f"n = {N}, {FIT_SAMPLE_SIZE} of them in the fit",
+        lambda: policy_hyperparameters(p.samples, p.kernel, "map", None, RNG(3)),
         Seconds(),
     )

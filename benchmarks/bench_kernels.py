@@ -1,4 +1,4 @@
-"""Gram matrices: one thin matrix product and one exponential."""
+"""Gram matrices, which cost one thin matrix product and one exponential."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RNG = np.random.default_rng(0)
 
 
 def as_printed(x: FloatArray) -> FloatArray:
-    """The kernels of an angle and of two other inputs, multiplied, at lengthscale one."""
+    """The printed formula: product of the kernels of an angle and two inputs, lengthscales 1."""
     angle, speed, action = (x[:, i, None] - x[:, i] for i in range(3))
     return (
         np.exp(-2.0 * np.sin(0.5 * angle) ** 2) * np.exp(-0.5 * speed**2) * np.exp(-0.5 * action**2)
@@ -29,19 +29,19 @@ def bench_gram_of_three_inputs(measure: Measure, n: int) -> None:
     factors = (Periodic((0,)), SquaredExponential((1,)), SquaredExponential((2,)))
     kernel = Kernel(factors, np.ones(3))
     exponents = np.log(as_printed(x))
-    asked = n >= 1500
+    limited = n >= 1500
     measure(
         "Gram matrix of angle, speed and action",
         f"n = {n}",
         lambda: kernel.gram(x),
-        TimesAsLong("numpy.exp", lambda: np.exp(exponents), at_most=1.5 if asked else None),
-        TimesFaster("the formula", lambda: as_printed(x), at_least=8.0 if asked else None),
+        TimesAsLong("numpy.exp", lambda: np.exp(exponents), at_most=1.5 if limited else None),
+        TimesFaster("the formula", lambda: as_printed(x), at_least=8.0 if limited else None),
     )
 
 
 @pytest.mark.parametrize("n", [1500, 3000])
 def bench_gram_of_images(measure: Measure, n: int) -> None:
-    """800 pixel values as they are; the swing-up's own kernel smooths them to far fewer."""
+    """800 unsmoothed pixel values; the kernel of the image swing-up smooths to far fewer."""
     angles = RNG.uniform(-np.pi, np.pi, n)
     x = np.concatenate([image(angles), image(angles) - image(angles + 0.1)], axis=1)
     groups = (tuple(range(400)), tuple(range(400, 800)))

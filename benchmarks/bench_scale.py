@@ -1,6 +1,6 @@
-"""Whole updates from many samples, through the same `learner.update`.
+"""Complete low-rank updates by `learner.update`.
 
-Up to a million samples, with memory: ``python benchmarks/low_rank.py scale``.
+``python benchmarks/low_rank.py scale`` measures up to a million samples, and memory.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from kreps import KREPS, Rollout
 from kreps.learning.collect import simulate
 from kreps.policies.exploration import BangBang
 
-STEPS = 50  # of a roll-out
+STEPS = 50  # of a rollout
 SEED = 100
 
 
 @cache
 def rollouts(n: int) -> list[Rollout]:
-    """n steps of the swing-up by the first policy."""
-    learner = KREPS(gym.make("kreps/SwingUp-v0"), recipe="observed", seed=SEED)
+    """n steps of the swing-up with bang-bang actions."""
+    learner = KREPS(gym.make("kreps/SwingUp-v0"), preset="single_step", seed=SEED)
     assert learner.env is not None
     count = n // STEPS
     noises = [np.random.default_rng([SEED, j]).standard_normal((STEPS, 1)) for j in range(count)]
@@ -32,10 +32,10 @@ def rollouts(n: int) -> list[Rollout]:
 
 
 def bench_update_from_many(measure: Measure) -> None:
-    """Ten times the samples are to take ten times as long, and a little more."""
+    """Ten times the samples may take at most twelve times as long."""
 
     def update(n: int) -> None:
-        KREPS(gym.make("kreps/SwingUp-v0"), recipe="observed", seed=SEED, window=None).update(
+        KREPS(gym.make("kreps/SwingUp-v0"), preset="single_step", seed=SEED, window=None).update(
             rollouts(n)
         )
 

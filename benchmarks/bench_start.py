@@ -1,4 +1,4 @@
-"""A fresh process: import, and on to the first policy."""
+"""A new process: importing the library, and learning the first policy."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ def bench_import(measure: Measure) -> None:
 
 @pytest.mark.benchmark(timer=children)
 def bench_first_policy(measure: Measure) -> None:
-    """The learner and SciPy are loaded when first asked for, not by ``import kreps``."""
+    """The learner and SciPy are imported at first use, not by ``import kreps``."""
     measure(
         "fresh process, to the first policy",
-        "30 roll-outs",
+        "30 rollouts",
         partial(python, FIRST_POLICY),
         Beyond("import kreps", partial(python, IMPORT), at_most=1.0),
         Beyond("from kreps import KREPS", partial(python, "from kreps import KREPS")),

@@ -1,4 +1,4 @@
-"""Whole updates, hyper-parameters included, through `learner.update`."""
+"""Complete updates by `learner.update`, fits of hyper-parameters included."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Glue to pytest-benchmark: the `measure` fixture, the peak probes, and the table at the end."""
+"""Fixtures for pytest-benchmark: `measure`, probes of the peak, and the table at the end."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def probes() -> Iterator[None]:
-    """The peak is probed before and after each file."""
+    """Measure the peak before and after each file."""
     PEAK.probe()
     yield
     PEAK.probe()
@@ -40,6 +40,6 @@ def pytest_terminal_summary(terminalreporter: Any, exitstatus: int, config: pyte
         return
     terminalreporter.write_line(record.table(record.rows(DONE, PEAK.best)))
     folder = config.getoption("record")
-    if folder is not None and exitstatus == 0:  # a table with gaps replaces none
+    if folder is not None and exitstatus == 0:  # never an incomplete table
         record.write(folder, DONE, PEAK, "make bench")
         terminalreporter.write_line(f"written to {folder}/benchmarks.md and .json")

@@ -1,4 +1,4 @@
-"""What a benchmark is judged by: a number made of its times, and the limit asked for."""
+"""The criteria of benchmarks: a number computed from times, and a limit on it."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ Work = Callable[[], object]
 
 @dataclass(frozen=True)
 class Times:
-    """CPU seconds of each round, of the work and of the references timed between its rounds.
+    """CPU seconds of each round of the work, and of the references timed between the rounds.
 
     Attributes:
         work: of the work.
         references: of each reference, by name.
-        memory: peak of what the work allocated, in bytes; None if in another process.
-        peak: operations per second of the best matrix product of the run.
+        memory: peak of the memory allocated by the work, in bytes; None in another process.
+        peak: operations per second of the fastest matrix product of the run.
     """
 
     work: list[float]
@@ -29,16 +29,16 @@ class Times:
 
 
 class Criterion(Protocol):
-    """One line of the table."""
+    """A number with limits: one row of the table."""
 
     @property
     def text(self) -> str:
-        """What the number is."""
+        """Name of the number."""
         ...
 
     @property
     def references(self) -> dict[str, Work]:
-        """What is to be timed beside the work, by name."""
+        """Calls to be timed together with the work, by name."""
         ...
 
     @property
@@ -52,7 +52,7 @@ class Criterion(Protocol):
 
 @dataclass(frozen=True)
 class _Limited:
-    """Either limit may be left open; with neither the line is for information."""
+    """Either limit may be None; with neither, the row is for information only."""
 
     at_least: float | None = field(default=None, kw_only=True)
     at_most: float | None = field(default=None, kw_only=True)
@@ -79,7 +79,7 @@ class Share(_Limited):
 
 @dataclass(frozen=True)
 class _Compared(_Limited):
-    """Judged against a reference timed in turns with the work."""
+    """A comparison with a reference that is timed alternately with the work."""
 
     name: str
     reference: Work
@@ -112,7 +112,7 @@ class TimesFaster(_Compared):
 
 
 class Beyond(_Compared):
-    """CPU seconds more than the reference."""
+    """CPU seconds of the work minus those of the reference."""
 
     @property
     def text(self) -> str:
@@ -123,7 +123,7 @@ class Beyond(_Compared):
 
 
 class Seconds(_Limited):
-    """CPU seconds of the best round."""
+    """CPU seconds of the fastest round."""
 
     text = "CPU s"
 
@@ -132,9 +132,10 @@ class Seconds(_Limited):
 
 
 class Milliseconds99(_Limited):
-    """CPU milliseconds that 99 of 100 rounds stay below, in the median of blocks of 500 rounds.
+    """99th percentile of the CPU milliseconds of a round: the median over blocks of 500 rounds.
 
-    A neighbour's burst spoils one block; what the code itself does now and then is in all.
+    Another process on the machine disturbs single blocks only; slow calls of the code itself are in
+    all of them.
     """
 
     text = "CPU ms, p99"
@@ -146,7 +147,7 @@ class Milliseconds99(_Limited):
 
 @dataclass(frozen=True)
 class Quality(_Limited):
-    """A number that is no time: what the speed must not be bought with."""
+    """A measure of accuracy, with a limit so that speed is not gained by a loss of accuracy."""
 
     text: str
     measure: Callable[[], float]

@@ -1,4 +1,4 @@
-"""Real data of the swing-up: what a learner has seen after some iterations."""
+"""Data of the swing-up: the samples of a learner after some iterations."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ SEED = 100
 
 @dataclass(frozen=True)
 class Update:
-    """An update about to be made.
+    """The state before an update, and its new rollouts.
 
     Attributes:
         learner: after some iterations.
-        state: what it carries.
-        rollouts: what is new.
+        state: of the learner.
+        rollouts: new ones.
     """
 
     learner: KREPS
@@ -34,19 +34,19 @@ class Update:
     rollouts: Sequence[Rollout]
 
     def samples(self) -> int:
-        window, _ = self.state.extended(self.rollouts, self.learner.task)
-        return len(window.transitions)
+        """Number of samples that the update learns from."""
+        return self.state.append(self.rollouts).steps
 
     def run(self) -> dict[str, float]:
-        """Make it from the same state each time; CPU seconds by stage."""
+        """Make the update, from the same state in each call; CPU seconds by stage."""
         self.learner.state = self.state
         return self.learner.update(self.rollouts).seconds
 
 
 @cache
 def next_update(iterations: int) -> Update:
-    """The update of the default swing-up learner after ``iterations`` others."""
-    learner = KREPS(gym.make("kreps/SwingUp-v0"), recipe="observed", seed=SEED).learn(
+    """The update of a single-step learner of the swing-up after ``iterations`` others."""
+    learner = KREPS(gym.make("kreps/SwingUp-v0"), preset="single_step", seed=SEED).learn(
         iterations, progress=False
     )
     assert learner.env is not None and learner.state.policy is not None
@@ -64,7 +64,7 @@ def next_update(iterations: int) -> Update:
 
 @dataclass(frozen=True)
 class SwingUpData:
-    """Transitions, and the learner that collected them."""
+    """Transitions and the learner that collected them."""
 
     learner: KREPS
     transitions: Transitions
@@ -72,8 +72,8 @@ class SwingUpData:
 
 @cache
 def swing_up(n: int) -> SwingUpData:
-    """The first n transitions that a default learner collects by its first policies."""
-    learner = KREPS(gym.make("kreps/SwingUp-v0"), recipe="observed", seed=SEED, window=1000)
+    """The first n transitions that a single-step learner collects."""
+    learner = KREPS(gym.make("kreps/SwingUp-v0"), preset="single_step", seed=SEED, window=1000)
     kept: list[Rollout] = []
     assert learner.env is not None
     learner.learn(3, progress=False)
@@ -96,7 +96,7 @@ def swing_up(n: int) -> SwingUpData:
 
 @cache
 def policy_with_support(m: int, stretch: float = 1.0) -> CostSensitiveGP:
-    """The learnt policy's hyper-parameters on m support points that all count.
+    """A policy with learnt hyper-parameters and m support points of non-negligible weight.
 
     Args:
         m: support points.

@@ -1,7 +1,7 @@
-"""Floating point operations of dense algorithms, an addition and a multiplication counting as two.
+"""Floating-point operations of dense algorithms; an addition and a multiplication count as two.
 
-"Nominal" counts pretend that a symmetric result is computed in full: half of that suffices, so
-a share of the peak above one is possible there, up to two.
+"Nominal" counts are of symmetric results computed in full.  Computing one half is enough, so that a
+nominal share of the peak can be up to two.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ def symmetric_product(n: int, k: int) -> int:
 
 
 def cholesky(n: int) -> int:
-    """Column j updates a triangle of side n - j, (n - j)^2 operations: their sum is n^3 / 3."""
+    """Column j updates a triangle of side n - j with (n - j)^2 operations; the sum is n^3 / 3."""
     return n**3 // 3
 
 
 def solve(n: int, k: int) -> int:
-    """Two triangular solves with k right-hand sides: each n^2 / 2 multiply-adds a side."""
+    """Two triangular solves with k right-hand sides, each n^2 / 2 multiply-adds per side."""
     return 2 * n * n * k
 
 

@@ -1,7 +1,7 @@
-"""Low rank against exact, and how its cost grows: figures and numbers for docs/performance.md.
+"""Low-rank updates: distance from the exact update, and cost.  Results are in docs/performance.md.
 
-python benchmarks/low_rank.py accuracy    # error of one update against the exact one, by rank
-python benchmarks/low_rank.py variance    # standard deviations of policies far from the data
+python benchmarks/low_rank.py accuracy    # distance of one update from the exact one, by rank
+python benchmarks/low_rank.py variance    # standard deviation of policies far from their data
 python benchmarks/low_rank.py scale       # CPU time and memory for 10^4 to 10^6 samples
 python benchmarks/low_rank.py growth      # CPU time by rank, and by the size of observations
 """
@@ -16,7 +16,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -34,20 +33,21 @@ from kreps.experiments.tables import markdown
 from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.kernel import Kernel, factors_of
 from kreps.kernels.threads import blas_threads
-from kreps.learning.collect import simulate
+from kreps.learning.collect import collect, simulate
 from kreps.plotting import BLUE, GREY, ORANGE, STYLE
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 from kreps.policies.exploration import BangBang
 from kreps.policies.sparse_gp import PolicySums, SparseGP
+from kreps.presets import changed
 
 TASK = "kreps/SwingUp-v0"
-SEEDS = range(110, 115)  # not those of any reported result
+SEEDS = range(110, 115)  # seeds that no other result uses
 RANKS = (25, 50, 100, 200, 400, 800)
 SIZES = (10_000, 30_000, 100_000, 300_000, 1_000_000)
 
 
 def write(out: Path, name: str, content: dict[str, Any], figure: Figure, table: str) -> None:
-    """Numbers, picture and table, with the command and the commit that made them."""
+    """Write numbers, picture and table, with the command and the commit that made them."""
     command = f"python benchmarks/low_rank.py {name}"
     out.mkdir(parents=True, exist_ok=True)
     text = json.dumps({"command": command, "commit": commit(), **content}, indent=2)
@@ -62,61 +62,65 @@ def write(out: Path, name: str, content: dict[str, Any], figure: Figure, table: 
 
 
 def errors(seed: int) -> dict[int, tuple[float, float, float]]:
-    """Of weights, V and policy, by rank, at the ninth update of a learner."""
-    env = gym.make(TASK)
-    learner = kreps.KREPS(env, seed=seed, preset="single_step")  # the same samples for all ranks
+    """Distances of the ninth update from the exact one, by rank: of weights, V and mean action."""
+    # a single step, so that all ranks learn from the same samples
+    learner = kreps.KREPS(gym.make(TASK), seed=seed, preset="single_step")
     learner.learn(8, progress=False)
-    state, fresh = learner.state, learner._collect(learner.env, None)
+    state, settings = learner.state, learner.settings
+    assert learner.env is not None and state.policy is not None
+    fresh = collect(
+        learner.env,
+        learner.task,
+        state.policy,
+        settings.rollouts_per_iteration,
+        seed=seed,
+        iteration=state.iteration,
+        restart_probability=settings.restart_probability,
+    )
     states = np.concatenate([rollout.observations for rollout in fresh])
 
-    def updated(
-        low_rank: kreps.LowRank | None, max_rank: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        learner.state = state
-        learner.settings = replace(
-            learner.settings, low_rank=low_rank, value=kreps.RKHS(max_rank=max_rank)
-        )
+    def updated(**changes: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        learner.state, learner.settings = state, changed(settings, changes)
         info = learner.update(fresh)
         policy = learner.state.policy
         assert policy is not None
         value = learner.value_function(states)
         return info.dual.weights, value - value.mean(), policy.greedy(states)
 
-    exact = updated(None, 400)
-    found: dict[int, tuple[float, float, float]] = {}
+    exact = updated(low_rank=None)
+    distances: dict[int, tuple[float, float, float]] = {}
     for rank in RANKS:
-        weights, value, actions = updated(kreps.LowRank(rank=rank, above=0), rank)
-        found[rank] = (
+        weights, value, actions = updated(
+            **{"low_rank.above": 0, "low_rank.rank": rank, "value.max_rank": rank}
+        )
+        distances[rank] = (
             float(np.abs(weights - exact[0]).sum() / 2.0),
             float((value - exact[1]).std() / exact[1].std()),
             float(np.sqrt(np.mean((actions - exact[2]) ** 2)) / learner.task.action_scale[0]),
         )
-    return found
+    return distances
 
 
 def accuracy(out: Path) -> None:
     with blas_threads(1):
         by_seed = [errors(seed) for seed in SEEDS]
-    names = (
-        "weights (total variation)",
-        "V (share of its deviation)",
-        "mean action (of half range)",
-    )
+    names = ("weights (total variation)", "V (share of its spread)", "mean action (of half range)")
+    values = np.array([[seed[rank] for rank in RANKS] for seed in by_seed])  # (seeds, ranks, 3)
+    medians = np.median(values, axis=0)
     with rc_context(STYLE):
         figure = Figure(figsize=(9.0, 3.2), layout="constrained")
         axes = figure.subplots(1, 3, sharex=True)
         for i, (axis, name) in enumerate(zip(axes, names, strict=True)):
-            values = np.array([[seed[rank][i] for rank in RANKS] for seed in by_seed])
-            axis.loglog(RANKS, np.maximum(values.T, 1e-6), color=BLUE, lw=0.6, alpha=0.4)
-            axis.loglog(RANKS, np.maximum(np.median(values, axis=0), 1e-6), "o-", color=BLUE, ms=3)
+            axis.loglog(RANKS, np.maximum(values[:, :, i].T, 1e-6), color=BLUE, lw=0.6, alpha=0.4)
+            axis.loglog(RANKS, np.maximum(medians[:, i], 1e-6), "o-", color=BLUE, ms=3)
             axis.set_title(name, fontsize=9)
-            axis.set_xlabel("rank of every basis")
+            axis.set_xlabel("rank of all bases")
             axis.set_xticks(RANKS, [str(rank) for rank in RANKS])
             axis.minorticks_off()
         axes[0].set_ylabel("distance from the exact update")
     rows = [
-        [str(rank)] + [f"{np.median([seed[rank][i] for seed in by_seed]):.1e}" for i in range(3)]
-        for rank in RANKS
+        [str(rank), *(f"{median:.1e}" for median in of_rank)]
+        for rank, of_rank in zip(RANKS, medians, strict=True)
     ]
     content = {"seeds": list(SEEDS), "errors": by_seed}
     write(out, "accuracy", content, figure, markdown(["rank", *names], rows))
@@ -177,10 +181,10 @@ def make_data(folder: Path, n: int, steps: int = 50) -> None:
     """Arrays of n steps of the first policy, rollout after rollout."""
     env = gym.make(TASK)
     task = kreps.KREPS(env).task
-    policy, count, at_once = BangBang(task), n // steps, 2000
+    policy, count, block = BangBang(task), n // steps, 2000
     parts = []
-    for first in range(0, count, at_once):
-        seeds = range(first, min(first + at_once, count))
+    for first in range(0, count, block):
+        seeds = range(first, min(first + block, count))
         noise = [np.random.default_rng([1, j]).standard_normal((steps, 1)) for j in seeds]
         parts += simulate(env, task, policy, seeds, noise)
     np.save(folder / "observations.npy", np.concatenate([r.observations for r in parts]))
@@ -189,8 +193,8 @@ def make_data(folder: Path, n: int, steps: int = 50) -> None:
 
 
 def peak_memory() -> float:
-    """Of this process, in GB."""
-    try:  # ru_maxrss counts the process that started this one
+    """Peak memory of this process in GB."""
+    try:  # ru_maxrss includes the parent process
         status = Path("/proc/self/status").read_text().splitlines()
         return int(next(line for line in status if line.startswith("VmHWM")).split()[1]) / 1e6
     except (OSError, StopIteration):
@@ -240,7 +244,7 @@ def scale(out: Path, largest: int) -> None:
             for n in sizes
             if n in wanted
         ]
-        work.sort(key=lambda each: (-each[0], -len(each[2])))  # the longest first
+        work.sort(key=lambda each: (-each[0], -len(each[2])))  # longest first
         with ProcessPoolExecutor(
             2, mp_context=get_context("spawn"), max_tasks_per_child=1
         ) as fresh:
@@ -270,7 +274,7 @@ def scale(out: Path, largest: int) -> None:
         for axis in (left, right):
             axis.set_xlabel("samples")
     table = markdown(
-        ["variant", "samples", "CPU s", "of it the dual", "Newton iterations", "peak GB"],
+        ["variant", "samples", "CPU s", "of these the dual", "Newton iterations", "peak GB"],
         [
             [
                 variant,
@@ -297,18 +301,19 @@ BASES = (100, 200, 400, 800, 1600)
 def walks(dimension: int, n: int = 20_000, steps: int = 50) -> list[kreps.Rollout]:
     """Random walks pushed by one action, with rewards for staying near zero."""
     rng = np.random.default_rng(dimension)
-    found = []
+    rollouts = []
     for _ in range(n // steps):
         actions = rng.uniform(-1.0, 1.0, (steps, 1))
         moves = 0.3 * rng.standard_normal((steps + 1, dimension))
         moves[1:, :1] += actions
         states = np.cumsum(moves, axis=0) / np.sqrt(dimension)
         rewards = -np.sum(states[:-1] ** 2, axis=1)
-        found.append(kreps.Rollout(states, actions, rewards))
-    return found
+        rollouts.append(kreps.Rollout(states, actions, rewards))
+    return rollouts
 
 
 def seconds_of_update(dimension: int, rank: int) -> dict[str, Any]:
+    """CPU seconds of one update of 20,000 samples with observations of this dimension."""
     task = kreps.TaskSpec(dimension, [-1.0], [1.0], groups=(tuple(range(dimension)),))
     learner = kreps.KREPS(
         task,
@@ -346,7 +351,7 @@ def growth(out: Path) -> None:
             whole = [row["cpu_seconds"] for row in rows]
             fits = [row["stages"]["embedding fit"] + row["stages"]["policy fit"] for row in rows]
             axis.loglog(x, whole, "o-", color=BLUE, ms=3, label="whole update")
-            axis.loglog(x, fits, "o--", color=GREY, ms=3, label="of it hyper-parameters")
+            axis.loglog(x, fits, "o--", color=GREY, ms=3, label="hyper-parameters")
             axis.set_xticks(x, [str(value) for value in x])
             axis.minorticks_off()
         left, right = figure.axes
@@ -375,15 +380,17 @@ def main() -> None:
     )
     parser.add_argument("what", choices=["accuracy", "variance", "scale", "growth"])
     parser.add_argument("--out", type=Path, default=Path("results"))
-    parser.add_argument("--largest", type=int, default=SIZES[-1], help="of the sizes of scale")
-    asked = parser.parse_args()
+    parser.add_argument(
+        "--largest", type=int, default=SIZES[-1], help="largest number of samples of scale"
+    )
+    options = parser.parse_args()
     work: dict[str, Callable[[], None]] = {
-        "accuracy": lambda: accuracy(asked.out),
-        "variance": lambda: variance(asked.out),
-        "scale": lambda: scale(asked.out, asked.largest),
-        "growth": lambda: growth(asked.out),
+        "accuracy": lambda: accuracy(options.out),
+        "variance": lambda: variance(options.out),
+        "scale": lambda: scale(options.out, options.largest),
+        "growth": lambda: growth(options.out),
     }
-    work[asked.what]()
+    work[options.what]()
 
 
 if __name__ == "__main__":

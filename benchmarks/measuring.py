@@ -1,4 +1,4 @@
-"""Times a piece of work in turns with its references, and tells what memory it took."""
+"""Times work alternately with its references, and measures the memory it allocates."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from typing import Any
 from criteria import Criterion, Times, Work
 
 BUDGET = 3.0
-"""CPU seconds to spend on the rounds of one benchmark, references included, if few suffice."""
+"""CPU seconds for the rounds of one benchmark, references included, within `ROUNDS`."""
 
 ROUNDS = (3, 20)
-"""Least and most rounds."""
+"""Smallest and largest number of rounds."""
 
 
 @dataclass
 class Measured:
-    """A benchmark as it was measured.
+    """The measurements of one benchmark.
 
     Attributes:
-        work, size: what was done, and to how much.
-        criteria: what it is judged by.
+        work, size: first columns of the table.
+        criteria: one per row of the table.
         times: CPU seconds by round.
-        references: the same of each reference, by name.
-        memory: peak of what the work allocated, in bytes; None if in another process.
-        details: what else is worth keeping.
+        references: CPU seconds by round of each reference, by name.
+        memory: peak of the memory allocated by the work, in bytes; None in another process.
+        details: further entries of the JSON file.
     """
 
     work: str
@@ -44,7 +44,7 @@ class Measured:
 
 
 def allocated(work: Work) -> int:
-    """Peak of what a call allocates, in bytes; NumPy tells tracemalloc of its arrays."""
+    """Peak of the memory that a call allocates, in bytes, NumPy arrays included."""
     tracemalloc.start()
     try:
         work()
@@ -55,12 +55,12 @@ def allocated(work: Work) -> int:
 
 @dataclass
 class Measure:
-    """What a benchmark calls, once: ``measure("Cholesky", "n = 1500", work, Share(...))``.
+    """Called once by each benchmark: ``measure("Cholesky", "n = 1500", work, Share(...))``.
 
     Attributes:
         benchmark: pytest-benchmark's fixture.
-        timer: gives CPU seconds.
-        done: filled with what was measured.
+        timer: returns CPU seconds.
+        done: list that measurements are added to.
     """
 
     benchmark: Any
@@ -79,9 +79,9 @@ class Measure:
 
         Args:
             work_name, size: first columns of the table.
-            work: called without arguments; whatever it needs is prepared before.
-            criteria: what it is judged by; their references are timed before each round.
-            rounds: how often; None chooses from the time that one call takes.
+            work: called without arguments; preparations are not timed.
+            criteria: their references are timed before each round.
+            rounds: number of calls; None derives it from the time of one call.
         """
         references = {
             name: call for criterion in criteria for name, call in criterion.references.items()
@@ -93,8 +93,8 @@ class Measure:
                 seconds[name].append(self._time(call))
 
         started = time.process_time()
-        memory: int | None = allocated(work)  # also warms caches and lazy imports up
-        if self.timer is not time.process_time:  # the work is done in another process
+        memory: int | None = allocated(work)  # also fills caches, and imports
+        if self.timer is not time.process_time:  # the work runs in another process
             memory = None
         if rounds is None:
             once = self._time(work) + sum(map(self._time, references.values()))

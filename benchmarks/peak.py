@@ -1,4 +1,4 @@
-"""The machine's own peak: the best float64 matrix product of this run."""
+"""The peak of the machine: operations per second of its fastest float64 matrix product."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ SIZES = (1000, 1500, 2000, 3000)
 
 @dataclass
 class Peak:
-    """Operations per CPU second; probed again and again, as the machine may be busy at times.
+    """Operations per CPU second.  Measured repeatedly, as the machine may be busy at times.
 
     Attributes:
-        probes: what each probe reached, (size, operations per second).
+        probes: (size, operations per CPU second) of each measurement.
     """
 
     probes: list[tuple[int, float]] = field(default_factory=list)
 
     def probe(self) -> None:
+        """Time one matrix product of each size."""
         for n in SIZES:
             a, b = np.random.default_rng(n).standard_normal((2, n, n))
             started = time.process_time()

@@ -1,33 +1,35 @@
-"""SAC and PPO of Stable-Baselines3 on our tasks, judged as kreps judges its own policies.
+"""SAC and PPO of Stable-Baselines3 on the tasks of kreps, with the same evaluation.
 
     python benchmarks/peers.py --tasks swing-up reaching --learners sac ppo --seeds 400-409
 
-A cell is one learner on one task with one seed.  Finished cells are kept in ``results/cells/peers``
-and not run again, so a stopped benchmark goes on where it was; when all are there, every cell of
-that folder is written to ``results/peers.json``, a row for each mark.  Settings are the published
-ones of rl-baselines3-zoo (https://github.com/DLR-RM/rl-baselines3-zoo, ``hyperparams/sac.yml`` and
-``ppo.yml``); tasks that the zoo does not know take those of Pendulum-v1, its nearest task.
+A trial is one learner on one task with one seed.  Finished trials are kept in
+``results/trials/peers`` and not run again, so that a stopped benchmark can be continued.  At the
+end, all trials of that folder are written to ``results/peers.json``, one row per mark.  Settings
+are the published ones of rl-baselines3-zoo (https://github.com/DLR-RM/rl-baselines3-zoo,
+``hyperparams/sac.yml`` and ``ppo.yml``).  Tasks that the zoo does not contain have the settings of
+Pendulum-v1, the most similar task.
 
-What is the same for all learners, and what is done so that the comparison is fair:
+Protocol, the same for all learners:
 
-- Training environments restart with probability 0.02 per step (`kreps.envs.RandomRestart`), which
-  is the process that policies are judged on.  Restarts come as truncations, and both learners
-  bootstrap there, as they do at any time limit.  Discount factors stay those of the zoo.
-- Angles, named by the environment's ``metadata["periodic_coordinates"]``, are given to the networks
-  as cosine and sine.  Other coordinates are given as they are, as the zoo does.
+- Training environments restart with probability 0.02 per step (`kreps.envs.RandomRestart`), as in
+  the process whose average reward is evaluated.  Restarts are truncations, and both learners
+  bootstrap there, as at any time limit.  Discount factors are those of the zoo.
+- The input of the networks has cosine and sine in place of each angle, which the environment's
+  ``metadata["periodic_coordinates"]`` lists.  Other coordinates are not changed, as in the zoo.
 - Actions are rescaled to [-1, 1].
-- Pixels already lie in [0, 1] and their differences in [-1, 1], so images are given as they are,
-  to the networks of two hidden layers that the zoo takes for Pendulum-v1: 20 x 20 pixels are too
-  few for its convolutional network, which needs 36 x 36.
-- A policy is judged at each mark, as what was learnt from at most that many environment steps, all
-  parallel environments counted.  PPO with 4 environments x 1024 steps first learns at 4096 steps:
-  before, it is judged as it began (``updates`` is 0).
-- Judging is `kreps.evaluation.evaluate` on the environment without restarts; with exploration that
-  depends on the state (gSDE) its noise is redrawn as often as in training.  Judging leaves
-  learning as it would have been without: a cell's numbers do not depend on its other marks.
-- Seconds are those of learning and of its environments, on one thread; judging is not counted.
+- Images are not changed: pixels are in [0, 1] and their differences in [-1, 1].  The networks have
+  the two hidden layers that the zoo has for Pendulum-v1.  20 x 20 pixels are too few for its
+  convolutional network, which needs 36 x 36.
+- A policy is evaluated at each mark: the latest one learnt from at most that many environment
+  steps, counted over all parallel environments.  PPO with 4 environments x 1024 steps makes its
+  first update at 4096 steps; before, the initial policy is evaluated (``updates`` is 0).
+- Policies are evaluated by `kreps.learning.evaluate.evaluate` on the environment without restarts.
+  Noise of state-dependent exploration (gSDE) is redrawn as often as in training.  The evaluation
+  does not change the random numbers of learning, so the rows of a trial do not depend on its other
+  marks.
+- Seconds are of learning and of its environments, on one thread, without evaluation.
 
-The learners need an environment of their own:
+The learners need a virtual environment of their own:
 
     python -m venv .venv-peers
     .venv-peers/bin/pip install -r benchmarks/peers_requirements.txt
@@ -72,22 +74,22 @@ from kreps.versions import versions
 RESTART = 0.02
 MARKS = (3000, 5000, 8000)
 LEARNERS = ("sac", "ppo")
-MISSING = """stable_baselines3 is not installed here; it needs an environment of its own:
+MISSING = """stable_baselines3 is not installed; it needs a virtual environment of its own:
     python -m venv .venv-peers
     .venv-peers/bin/pip install -r benchmarks/peers_requirements.txt
     .venv-peers/bin/pip install -e .
-and then .venv-peers/bin/python in place of python"""
+then use .venv-peers/bin/python instead of python"""
 
 
 @dataclass(frozen=True)
 class Task:
-    """One task and how policies are judged on it.
+    """One task and the evaluation of policies on it.
 
     Attributes:
         environment: Gymnasium name.
-        zoo: the task of the zoo whose settings are taken.
-        episodes, steps: roll-outs of an evaluation, and their length at most; fewer where the
-            environment steps one by one or observes images.
+        zoo: the task of the zoo that the settings are of.
+        episodes, steps: rollouts of an evaluation and their largest length; fewer where the
+            environment simulates rollouts one at a time or observes images.
     """
 
     environment: str
@@ -150,18 +152,18 @@ SETTINGS: dict[tuple[str, str], dict[str, Any]] = {
         "policy_kwargs": {"log_std_init": -3.29, "ortho_init": False},
     },
 }
-"""By learner and task of the zoo; what is not named has Stable-Baselines3's default."""
+"""By learner and task of the zoo; other settings are the defaults of Stable-Baselines3."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """What one worker is asked to do.
+    """The work of one worker process.
 
     Attributes:
-        task: a name of `TASKS`.
+        task: key of `TASKS`.
         learner: one of `LEARNERS`.
         seed: of learning and of the evaluations.
-        marks: environment steps at which the policy is judged, ascending.
+        marks: numbers of environment steps at which the policy is evaluated, ascending.
     """
 
     task: str
@@ -174,7 +176,7 @@ class Trial:
         return SETTINGS[self.learner, TASKS[self.task].zoo]
 
     def description(self) -> dict[str, Any]:
-        """All that its numbers depend on, as it is read back from a file; marks do not matter."""
+        """Everything that the rows depend on, in the form that a JSON file returns it in."""
         about = {
             "task": self.task,
             "learner": self.learner,
@@ -200,7 +202,7 @@ class Trial:
 
 
 def network_input(states: FloatArray, periodic: Sequence[int]) -> NDArray[np.float32]:
-    """What the networks see of observations (m, ds): their angles (rad) as cosine and sine.
+    """Input of the networks for observations (m, ds): angles (rad) as cosine and sine.
 
     Returns:
         (m, ds + number of angles): the other coordinates in order, then cosines, then sines.
@@ -211,7 +213,7 @@ def network_input(states: FloatArray, periodic: Sequence[int]) -> NDArray[np.flo
 
 
 def training_environment(name: str) -> Environment:
-    """The environment as the learners see it: restarts, cosines and sines, actions in [-1, 1]."""
+    """The environment with restarts, cosines and sines of angles, and actions in [-1, 1]."""
     env: Environment = RandomRestart(gym.make(name), RESTART)
     task = task_of(env)
     size = task.observation_size + len(task.periodic)
@@ -225,25 +227,27 @@ def training_environment(name: str) -> Environment:
     return gym.wrappers.RescaleAction(env, -one, one)
 
 
-def model_of(cell: Trial) -> Any:
-    """The untrained learner of a cell, with its environments."""
+def model_of(trial: Trial) -> Any:
+    """The untrained learner of a trial, with its environments."""
     from stable_baselines3 import PPO, SAC
     from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-    # the zoo's mini-batch on the mountain car is larger than what PPO collects there
+    # the mini-batch of the zoo for mountain car is larger than the rollout of PPO
     warnings.filterwarnings("ignore", message="You have specified a mini-batch size")
-    settings = dict(cell.settings)
-    make = partial(training_environment, TASKS[cell.task].environment)
+    settings = dict(trial.settings)
+    make = partial(training_environment, TASKS[trial.task].environment)
     envs: VecEnv = DummyVecEnv([make] * settings.pop("n_envs", 1))
     if settings.pop("normalize", False):
         envs = VecNormalize(envs, gamma=settings["gamma"])
-    kind = {"sac": SAC, "ppo": PPO}[cell.learner]
-    seed = integer_seed(cell.seed, Purpose.ENVIRONMENT)  # the environments have it and the next
+    kind = {"sac": SAC, "ppo": PPO}[trial.learner]
+    seed = integer_seed(
+        trial.seed, Purpose.ENVIRONMENT
+    )  # of the first environment; others add 1, 2, ...
     return kind("MlpPolicy", envs, seed=seed, device="cpu", **settings)
 
 
 def noise_period(settings: Mapping[str, Any]) -> int | None:
-    """Steps for which training keeps the noise of gSDE; None without gSDE."""
+    """Steps between draws of the noise of gSDE in training; None without gSDE."""
     if not settings.get("use_sde"):
         return None
     steps: int = next(
@@ -253,12 +257,12 @@ def noise_period(settings: Mapping[str, Any]) -> int | None:
 
 
 class NetworkPolicy:
-    """A copy of a learnt policy, as `kreps.evaluation` asks for one.
+    """A copy of a learnt policy, with the interface that `kreps.learning.evaluate` needs.
 
     Args:
-        model: the learner that has it.
-        task: of the environment that it is judged on.
-        period: steps between draws of the noise of gSDE; None: each action has noise of its own.
+        model: the learner.
+        task: of the environment of the evaluation.
+        period: steps between draws of the noise of gSDE; None draws it for each action.
         greedy: without exploration.
     """
 
@@ -272,19 +276,19 @@ class NetworkPolicy:
         self.calls = 0
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
-        """Actions (m, da) in the task's units for observations (m, ds); torch draws the noise."""
+        """Actions (m, da) in units of the task for observations (m, ds), with noise from torch."""
         if self.period is not None and self.calls % self.period == 0:
             self.policy.reset_noise(len(states))
         self.calls += 1
-        seen = network_input(states, self.task.periodic)
+        inputs = network_input(states, self.task.periodic)
         if self.normaliser is not None:
-            seen = self.normaliser.normalize_obs(seen)
-        actions, _ = self.policy.predict(seen, deterministic=self.greedy)
+            inputs = self.normaliser.normalize_obs(inputs)
+        actions, _ = self.policy.predict(inputs, deterministic=self.greedy)
         return self.task.unscaled(np.asarray(actions, dtype=np.float64))
 
 
 class Stopwatch:
-    """CPU and wall seconds since it was made, without those in which it was paused."""
+    """CPU and wall-clock seconds since its creation, without paused ones."""
 
     def __init__(self) -> None:
         self._since = self._now()
@@ -295,7 +299,7 @@ class Stopwatch:
 
     @contextmanager
     def paused(self) -> Iterator[tuple[float, float]]:
-        """Stops while the block runs, and gives it the CPU and wall seconds so far."""
+        """Pause while the block runs; yields the CPU and wall-clock seconds so far."""
         at = self._now()
         cpu, wall = (at - self._since).tolist()
         try:
@@ -304,31 +308,31 @@ class Stopwatch:
             self._since += self._now() - at
 
 
-class Judge:
-    """Stable-Baselines3's callback: called after each step, before what is learnt from it.
+class MarkEvaluation:
+    """Callback of Stable-Baselines3 that evaluates the policy at each mark.
 
-    So at the first step beyond a mark the policy is what was learnt from at most that many.
-    Learning ends after the last mark.
+    It is called after each step and before the update from it, so that at the first step beyond a
+    mark the policy was learnt from at most that many steps.  Learning ends after the last mark.
     """
 
-    def __init__(self, cell: Trial, model: Any) -> None:
-        self.cell, self.model = cell, model
-        self.env = gym.make(TASKS[cell.task].environment)
+    def __init__(self, trial: Trial, model: Any) -> None:
+        self.trial, self.model = trial, model
+        self.env = gym.make(TASKS[trial.task].environment)
         self.task = task_of(self.env)
-        self.left = list(cell.marks)
+        self.left = list(trial.marks)
         self.rows: list[dict[str, Any]] = []
         self.watch = Stopwatch()
 
     def __call__(self, local: dict[str, Any], global_: dict[str, Any]) -> bool:
-        """Whether to go on."""
+        """Whether learning is to continue."""
         while self.left and self.model.num_timesteps > self.left[0]:
             with self.watch.paused() as (cpu, wall):
                 scores = self.scores()
             self.rows.append(
                 {
-                    "task": self.cell.task,
-                    "learner": self.cell.learner,
-                    "seed": self.cell.seed,
+                    "task": self.trial.task,
+                    "learner": self.trial.learner,
+                    "seed": self.trial.seed,
                     "mark": self.left.pop(0),
                     **scores,
                     "updates": self.model._n_updates,
@@ -342,42 +346,44 @@ class Judge:
         """Average rewards per step and their standard errors, with and without exploration."""
         import torch
 
-        found: dict[str, float] = {}
-        about = TASKS[self.cell.task]
+        scores: dict[str, float] = {}
+        about = TASKS[self.trial.task]
         for name in ("stochastic", "greedy"):
-            with torch.random.fork_rng(devices=[]):  # learning draws as if nothing had been
-                torch.manual_seed(integer_seed(self.cell.seed, Purpose.EVALUATION_POLICY))
+            with torch.random.fork_rng(
+                devices=[]
+            ):  # does not change the random numbers of learning
+                torch.manual_seed(integer_seed(self.trial.seed, Purpose.EVALUATION_POLICY))
                 score = evaluate(
                     self.env,
                     self.task,
                     NetworkPolicy(
-                        self.model, self.task, noise_period(self.cell.settings), name == "greedy"
+                        self.model, self.task, noise_period(self.trial.settings), name == "greedy"
                     ),
                     restart_probability=RESTART,
                     episodes=about.episodes,
                     steps=about.steps,
-                    seed=self.cell.seed,
+                    seed=self.trial.seed,
                 )
-            found[name], found[f"{name}_standard_error"] = score.mean, score.standard_error
-        return found
+            scores[name], scores[f"{name}_standard_error"] = score.mean, score.standard_error
+        return scores
 
 
-def run_cell(cell: Trial) -> dict[str, Any]:
-    """Learn and judge: the cell's description, one row per mark, and the versions used."""
+def run_trial(trial: Trial) -> dict[str, Any]:
+    """Learn and evaluate: the description of the trial, one row per mark, and versions."""
     import torch
 
     torch.set_num_threads(1)
     with blas_threads(1):
-        model = model_of(cell)
-        judge = Judge(cell, model)
-        # one round of steps beyond the last mark, at which the judge stops it
-        model.learn(cell.marks[-1] + model.n_envs, callback=judge)
+        model = model_of(trial)
+        evaluation = MarkEvaluation(trial, model)
+        # one round of steps beyond the last mark, where the callback ends learning
+        model.learn(trial.marks[-1] + model.n_envs, callback=evaluation)
     names = ("gymnasium", "stable-baselines3", "torch")
     return {
-        "cell": cell.description(),
-        "command": cell.command(),
+        "trial": trial.description(),
+        "command": trial.command(),
         "versions": {**versions(), **{name: version(name) for name in names}},
-        "rows": judge.rows,
+        "rows": evaluation.rows,
     }
 
 
@@ -385,30 +391,34 @@ def run_cell(cell: Trial) -> dict[str, Any]:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """A finished cell."""
+    """The result of a finished trial."""
     try:
         found: dict[str, Any] = json.loads(path.read_text())
-        if not {"cell", "rows", "commit", "command", "versions"} <= found.keys():
+        if not {"trial", "rows", "commit", "command", "versions"} <= found.keys():
             raise ValueError("parts are missing")
         return found
     except (ValueError, AttributeError) as error:
-        raise SystemExit(f"{path} is damaged ({error}); remove it to run the cell again") from error
+        raise SystemExit(
+            f"{path} is damaged ({error}); remove it to run the trial again"
+        ) from error
 
 
-def left_of(cell: Trial, folder: Path) -> Trial | None:
-    """What is to be run; None if it is there.
+def remaining(trial: Trial, folder: Path) -> Trial | None:
+    """The trial that has to be run; None if its result is in the folder.
 
-    A cell that is there with other marks is run again with those and the new ones.
+    A trial whose result has other marks is run again with those and the new ones.
     """
-    path = cell.path(folder)
+    path = trial.path(folder)
     if not path.exists():
-        return cell
+        return trial
     found = read(path)
-    if found["cell"] != cell.description():
-        return cell
+    if found["trial"] != trial.description():
+        return trial
     have = {row["mark"] for row in found["rows"]}
     return (
-        None if have >= {*cell.marks} else replace(cell, marks=tuple(sorted({*have, *cell.marks})))
+        None
+        if have >= {*trial.marks}
+        else replace(trial, marks=tuple(sorted({*have, *trial.marks})))
     )
 
 
@@ -418,15 +428,15 @@ def write(path: Path, content: Mapping[str, Any], indent: int | None = None) -> 
 
 
 def gather(folder: Path, path: Path) -> int:
-    """All finished cells of a folder in one file; how many they are.
+    """Write all finished trials of a folder to one file, and return their number.
 
-    It has the learners' settings by task, and a row for each cell and mark.
+    The file has the settings of each learner on each task, and one row per trial and mark.
     """
     found = [read(file) for file in sorted(folder.glob("*/*.json"))]
-    found.sort(key=lambda r: (r["cell"]["task"], r["cell"]["learner"], r["cell"]["seed"]))
+    found.sort(key=lambda r: (r["trial"]["task"], r["trial"]["learner"], r["trial"]["seed"]))
     settings = {
-        f"{r['cell']['task']}: {r['cell']['learner']}": {
-            name: value for name, value in r["cell"].items() if name != "seed"
+        f"{r['trial']['task']}: {r['trial']['learner']}": {
+            name: value for name, value in r["trial"].items() if name != "seed"
         }
         for r in found
     }
@@ -442,33 +452,33 @@ def gather(folder: Path, path: Path) -> int:
 # ---- the command line -------------------------------------------------------------------------
 
 
-def run_trials(cells: Sequence[Trial], workers: int, folder: Path) -> dict[str, BaseException]:
-    """Run what is not in the folder yet; the errors of the cells that failed, by name."""
-    left = [todo for cell in cells if (todo := left_of(cell, folder)) is not None]
-    count = len(cells) - len(left)
-    print(f"{count} of {len(cells)} cells are there", flush=True)
+def run_trials(trials: Sequence[Trial], workers: int, folder: Path) -> dict[str, BaseException]:
+    """Run the trials without a result in the folder; errors of failed trials, by name."""
+    left = [todo for trial in trials if (todo := remaining(trial, folder)) is not None]
+    count = len(trials) - len(left)
+    print(f"{count} of {len(trials)} trials have a result", flush=True)
     failures: dict[str, BaseException] = {}
     if not left:
         return failures
     if find_spec("stable_baselines3") is None:
         raise SystemExit(MISSING)
-    source = commit()  # of the code that is about to run, whatever happens to the tree meanwhile
+    source = commit()  # now: the source tree may change while the trials run
     with executor(workers, None) as pool:
-        running = {pool.submit(run_cell, cell): cell for cell in left}
+        running = {pool.submit(run_trial, trial): trial for trial in left}
         try:
             for future in as_completed(running):
-                cell = running[future]
-                name = f"{cell.task}, {cell.learner}, seed {cell.seed}"
+                trial = running[future]
+                name = f"{trial.task}, {trial.learner}, seed {trial.seed}"
                 if (error := future.exception()) is not None:
                     failures[name] = error
                     print(f"FAILED: {name}: {type(error).__name__}: {error}", flush=True)
                     continue
                 result = {"commit": source, **future.result()}
-                write(cell.path(folder), result)
+                write(trial.path(folder), result)
                 count += 1
                 last = result["rows"][-1]
                 print(
-                    f"{count}/{len(cells)} cells: {name}: after {last['mark']} steps "
+                    f"{count}/{len(trials)} trials: {name}: after {last['mark']} steps "
                     f"{last['stochastic']:.2f} stochastic, {last['greedy']:.2f} greedy, "
                     f"{last['cpu_seconds']:.0f} CPU s",
                     flush=True,
@@ -529,36 +539,36 @@ def main() -> None:
         type=positive,
         default=MARKS,
         metavar="STEPS",
-        help="environment steps at which policies are judged; learning ends with "
+        help="environment steps at which policies are evaluated; learning ends with "
         f"the last (default: {' '.join(map(str, MARKS))})",
     )
     parser.add_argument(
         "--workers",
         type=positive,
         default=1,
-        help="cells that run at a time, each on one thread (default: 1)",
+        help="trials that run at the same time, each on one thread (default: 1)",
     )
     parser.add_argument(
         "--out",
         type=Path,
         default=Path("results"),
-        help="cells go to OUT/cells/peers, the rows to OUT/peers.json (default: results)",
+        help="trials go to OUT/trials/peers, rows to OUT/peers.json (default: results)",
     )
     options = parser.parse_args()
     seeds = dict.fromkeys(seed for part in options.seeds for seed in part)
     marks = tuple(sorted(set(options.marks)))
-    cells = [
+    trials = [
         Trial(task, learner, seed, marks)
-        for seed in seeds  # seed by seed, so that partial results compare
+        for seed in seeds  # partial results can be compared
         for task in dict.fromkeys(options.tasks)
         for learner in dict.fromkeys(options.learners)
     ]
-    folder = options.out / "cells" / "peers"
-    failures = run_trials(cells, options.workers, folder)
+    folder = options.out / "trials" / "peers"
+    failures = run_trials(trials, options.workers, folder)
     count = gather(folder, options.out / "peers.json")
-    print(f"{options.out / 'peers.json'} has {count} cells")
+    print(f"{options.out / 'peers.json'} has {count} trials")
     if failures:
-        raise SystemExit(f"{len(failures)} cells failed; the others are kept, so call it again")
+        raise SystemExit(f"{len(failures)} trials failed; the others are kept, so call it again")
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""CPU and wall seconds of kreps and of SAC for the same steps, one after the other on one machine.
+"""CPU and wall-clock seconds of kreps and SAC for equal numbers of steps, on one machine.
 
     .venv-peers/bin/python benchmarks/peers_seconds.py --seeds 0
 
-Writes ``results/peers-seconds.json`` and ``.md``.  `peers.py` compares what is learnt; seconds that
-were taken on different days compare machines as well.  Here each task is learnt by one and then by
-the other, each in a new process on one thread, up to the same 8000 environment steps and without
-any evaluation.  Settings and environments are those of `peers.py`, of kreps none: ``KREPS(env)``.
-A learner that works in batches is charged for those that end by then.
+Writes ``results/peers-seconds.json`` and ``.md``.  `peers.py` compares rewards; its seconds may be
+from different days and loads of the machine.  Here each task is learnt by the two learners one
+after the other, each in a new process on one thread, for 8000 environment steps, without any
+evaluation.  SAC has the settings and environments of `peers.py`; kreps is ``KREPS(env)``.  Of a
+learner that works in batches, the batches that end within these steps are counted.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ LEARNERS = ("kreps", "sac")
 
 
 def seconds_of_kreps(task: str, seed: int, steps: int) -> tuple[float, float]:
-    """CPU and wall seconds of the updates, and their roll-outs, that end by so many steps."""
+    """CPU and wall-clock seconds of the rollouts and updates that end within so many steps."""
     learner = kreps.KREPS(gym.make(TASKS[task].environment), seed=seed)
     watch = Stopwatch()
     by_then = (0.0, 0.0)
@@ -45,7 +45,7 @@ def seconds_of_kreps(task: str, seed: int, steps: int) -> tuple[float, float]:
 
 
 def seconds_of_sac(task: str, seed: int, steps: int) -> tuple[float, float]:
-    """The same of SAC, which learns after each step or each few."""
+    """CPU and wall-clock seconds of SAC for so many steps."""
     import torch
 
     torch.set_num_threads(1)
@@ -58,7 +58,7 @@ def seconds_of_sac(task: str, seed: int, steps: int) -> tuple[float, float]:
 
 
 def measured(learner: str, task: str, seed: int, steps: int) -> dict[str, Any]:
-    """Measured here, in a process of its own."""
+    """One row of the result; called in a new process."""
     measure = {"kreps": seconds_of_kreps, "sac": seconds_of_sac}[learner]
     cpu, wall = measure(task, seed, steps)
     return {
@@ -71,7 +71,7 @@ def measured(learner: str, task: str, seed: int, steps: int) -> dict[str, Any]:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Means over seeds as Markdown, a line for each task."""
+    """Means over seeds as a Markdown table, one row per task."""
     lines = []
     for task in dict.fromkeys(row["task"] for row in rows):
         found = [row for row in rows if row["task"] == task]

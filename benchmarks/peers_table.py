@@ -1,11 +1,11 @@
-"""kreps beside its peers at equal environment steps: writes ``results/peers.md``.
+"""Table of kreps, SAC and PPO at equal environment steps: writes ``results/peers.md``.
 
     python benchmarks/peers_table.py
 
 It reads ``results/peers.json`` (Stable-Baselines3, by ``benchmarks/peers.py``), ``untuned.csv``
 (``kreps reproduce untuned``) and ``figure-1b.csv`` (REPS on fixed features, ``kreps reproduce
-figure-1b``).  Every entry is of the policy learnt from at most so many steps.
-CPU seconds of different days are of different loads of the machine: `peers_seconds.py` compares.
+figure-1b``).  Each entry is of the latest policy learnt from at most so many steps.  CPU seconds
+are from different days and loads of the machine; `peers_seconds.py` measures them together.
 """
 
 from __future__ import annotations
@@ -31,19 +31,19 @@ TASKS = {
     "pendulum": "pendulum",
     "mountain-car": "mountain-car",
 }
-"""Tasks of the peers and what the experiment of kreps calls them."""
+"""Names of the tasks in `peers.py` and in the experiment of kreps."""
 
 Curve = list[dict[str, Any]]
 
 
 def cpu_seconds(curve: Sequence[dict[str, Any]]) -> float:
-    """To learn from the last mark's steps, roll-outs and updates, evaluation not counted."""
+    """CPU seconds of rollouts and updates up to the last mark, without evaluation."""
     counted = [row for row in curve if float(row["steps"]) <= MARKS[-1]]
     return sum(float(r["rollout_cpu_seconds"]) + float(r["update_cpu_seconds"]) for r in counted)
 
 
 def of_kreps(file: str, task: str, method: str | None) -> list[Curve]:
-    """The curves of a task (and method), one a seed."""
+    """The rows of each seed of a task, of one method or of all (None)."""
     with open(RESULTS / file, newline="") as opened:
         rows = [row for row in csv.DictReader(opened) if row["task"] == task]
     rows = [row for row in rows if method in (None, row["method"])]
@@ -51,7 +51,7 @@ def of_kreps(file: str, task: str, method: str | None) -> list[Curve]:
 
 
 def of_peers(task: str, learner: str) -> list[Curve]:
-    """The same of a peer: a row a mark."""
+    """The rows of each seed of another learner, one row per mark."""
     rows = json.loads((RESULTS / "peers.json").read_text())["rows"]
     mine = [{**r, "steps": r["mark"]} for r in rows if (r["task"], r["learner"]) == (task, learner)]
     return [[r for r in mine if r["seed"] == seed] for seed in sorted({r["seed"] for r in mine})]
@@ -66,7 +66,7 @@ def line(task: str, name: str, curves: list[Curve], seconds: Sequence[float]) ->
 
 
 def table() -> str:
-    """As Markdown."""
+    """The table as Markdown."""
     lines = []
     for task, ours in TASKS.items():
         curves = of_kreps("untuned.csv", ours, None)

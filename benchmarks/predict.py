@@ -1,16 +1,16 @@
-"""The control loop: how long `Policy.predict` takes, whether memory grows, what compression costs.
+"""Latency of `Policy.predict`, growth of its memory, and reward lost by compression.
 
     python benchmarks/predict.py
 
-Times one call after the other, as a robot makes them, on one BLAS thread with garbage collection
-on, for policies of 1500 support points on the swing-up (processor time beside that of the clock: a
-busy neighbour shows in the latter only):
+Times single calls, as in a control loop, on one BLAS thread with garbage collection enabled.  Times
+are by the clock and of the processor; other processes on the machine affect the former only.  The
+policies are of the swing-up and have 1500 support points:
 
-- learnt: the support points of a learnt policy, the top_by_weight 1500;
-- rough: the same with lengthscales so short that no support point can be spared;
-- compressed: the learnt one on 50 centres.
+- learnt: a learnt policy with its 1500 support points of largest weight;
+- rough: the same with lengthscales so short that every support point is needed;
+- compressed: the learnt one, compressed to 50 centres.
 
-Then policies of three seeds are compressed to fewer and fewer centres and evaluated.  Writes
+Then policies of three seeds are compressed to several numbers of centres and evaluated.  Writes
 ``results/predict.json``, ``predict.md`` and ``predict.png``.
 """
 
@@ -49,7 +49,7 @@ SEEDS = (100, 101, 102)
 RESTART = 0.02
 MODES = ("greedy", "stochastic")
 GOALS = {"greedy": 0.1, "with noise": 1.0}
-"""In ms, for the 99th percentile."""
+"""Limits of the 99th percentile in ms."""
 
 
 def learner_of(seed: int) -> kreps.KREPS:
@@ -57,7 +57,7 @@ def learner_of(seed: int) -> kreps.KREPS:
 
 
 def top_by_weight(policy: CostSensitiveGP, count: int) -> CostSensitiveGP:
-    """The policy of its ``count`` samples of most weight."""
+    """The policy restricted to its ``count`` samples of largest weight."""
     rows = np.sort(np.argsort(-policy.weights, kind="stable")[:count])
     return replace(
         policy,
@@ -85,10 +85,10 @@ def policies_to_time() -> dict[str, kreps.Policy]:
 def milliseconds(
     policy: kreps.Policy, states: FloatArray, calls: int, greedy: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Of each call, by the clock and of the processor (calls,): the rest is its neighbours'."""
+    """Milliseconds (calls,) of each call, by the clock and of the processor."""
     rows = [row.copy() for row in states]
     clock, processor = np.empty(calls), np.empty(calls)
-    for i in range(-1000, calls):  # the first ones warm the caches
+    for i in range(-1000, calls):  # the first 1000 calls fill the caches and are not recorded
         row = rows[i % len(rows)]
         used = time.thread_time_ns()
         started = time.perf_counter_ns()
@@ -101,12 +101,12 @@ def milliseconds(
 
 
 def memory(policy: kreps.Policy, states: FloatArray, calls: int, greedy: bool) -> dict[str, float]:
-    """What is held after the calls beyond what was before, and at most meanwhile, in kB."""
+    """Memory in kB that is allocated after the calls, and at the peak, beyond that before."""
     rows = [row.copy() for row in states]
     policy.predict(rows[0], deterministic=greedy)
     tracemalloc.start()
     try:
-        for i in range(100):  # what is made once, such as the numbers of tracemalloc itself
+        for i in range(100):  # allocations that are made once, such as those of tracemalloc
             policy.predict(rows[i % len(rows)], deterministic=greedy)
         gc.collect()
         tracemalloc.reset_peak()
@@ -122,7 +122,7 @@ def memory(policy: kreps.Policy, states: FloatArray, calls: int, greedy: bool) -
 
 
 def timings(calls: int) -> tuple[list[dict[str, Any]], dict[str, tuple[FloatArray, FloatArray]]]:
-    """A row for each policy and mode, and all times in ms, of clock and processor."""
+    """One row per policy and mode, and all times in ms, by clock and processor."""
     policies = policies_to_time()
     states = policies["learnt"].process.states
     rows, times = [], {}
@@ -155,7 +155,7 @@ def timings(calls: int) -> tuple[list[dict[str, Any]], dict[str, tuple[FloatArra
 
 
 def compression(iterations: int) -> list[dict[str, Any]]:
-    """A row for each seed and number of centres."""
+    """One row per seed and number of centres."""
     rows = []
     for seed in SEEDS:
         learner = learner_of(seed)
@@ -216,13 +216,13 @@ def tables(content: dict[str, Any]) -> str:
     exact = {row["seed"]: row for row in rows if row["centres"] == "exact"}
     body = []
     for c in CENTRES:
-        cells = [str(c)]
+        entries = [str(c)]
         for seed, of in exact.items():
             (row,) = (r for r in rows if r["seed"] == seed and r["centres"] == c)
             # adding zero turns -0.0 into 0.0
             lost = " / ".join(f"{round(of[name] - row[name], 2) + 0.0:.2f}" for name in MODES)
-            cells.append(f"{lost} ({row['off_at_samples']:.3f})")
-        body.append(cells)
+            entries.append(f"{lost} ({row['off_at_samples']:.3f})")
+        body.append(entries)
     headings = [
         f"seed {seed}: {of['evaluated_centres']} pivots of {of['support']}, "
         + " / ".join(f"{of[name]:.2f}" for name in MODES)
@@ -231,8 +231,8 @@ def tables(content: dict[str, Any]) -> str:
     return (
         f"{timed}\n\n{content['calls']} calls each, on {content['processors']} processors "
         f"with a load average of {content['load_average_at_start']:.1f} at the start.\n\n"
-        "Reward per step lost by compression, greedy / stochastic, and in brackets how "
-        "far the action is off at the samples (root mean square, in units of its scale). The "
+        "Reward per step lost by compression, greedy / stochastic, and in brackets the root mean "
+        "square difference of the actions at the samples, in units of the action scale. The "
         "headings have the rewards of the exact policies.\n\n"
         f"{markdown(('centres', *headings), body)}\n"
     )
@@ -295,7 +295,7 @@ def main() -> None:
         command += f" --calls {options.calls}"
     if options.iterations != parser.get_default("iterations"):
         command += f" --iterations {options.iterations}"
-    source = commit()  # of the code that runs, whatever happens to the tree meanwhile
+    source = commit()  # now: the source tree may change while this runs
     load = os.getloadavg()[0]
     assert gc.isenabled()
     with blas_threads(1):

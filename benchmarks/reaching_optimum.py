@@ -1,12 +1,13 @@
-"""The optimum of the reaching task by direct optimal control: what learners are measured against.
+"""Best known reward of the reaching task, by direct optimal control: a reference for learners.
 
     python benchmarks/reaching_optimum.py --steps 40 --starts 3
 
 The task is deterministic, so its optimum is one sequence of torques over the first ``--steps``
-periods (none are needed once the arm rests at the target).  It has many local optima, and random
-starts find poor ones.  So the search starts from what greedy policies of kernel REPS do, one
-learner a start, and goes on by L-BFGS-B with central differences.  That is a best known value, not
-a proven optimum.  Writes ``results/reaching-optimum.json``.
+periods; the arm then rests at the target without torque.  There are many local optima, and searches
+from random sequences end in poor ones.  The search therefore starts from the torques of greedy
+policies of kernel REPS, one learner per start, and continues by L-BFGS-B with central differences.
+The result is the best known value and not a proven optimum.  Writes
+``results/reaching-optimum.json``.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ from kreps.learning.evaluate import Greedy, evaluation_rollouts
 from kreps.versions import versions
 
 RESTART = 0.02
-HORIZON = 400  # periods of the value that is reported, of which 3e-4 of the weight is missing
-SEARCHED = 100  # periods that the search looks at: at rest the others are as good as the last
+HORIZON = 400  # periods of the reported value; later ones have a weight of 3e-4
+SEARCHED = 100  # periods of the search; the arm rests in later ones
 DIFFERENCE = 1e-5  # N m
-FIRST_SEED = 300  # no result uses these seeds
+FIRST_SEED = 300  # seeds that no other result uses
 
 
 def average_rewards(torques: FloatArray, horizon: int = HORIZON) -> FloatArray:
@@ -58,7 +59,7 @@ def loss_and_gradient(x: FloatArray, steps: int) -> tuple[float, FloatArray]:
 
 
 def learnt_torques(seed: int, steps: int) -> FloatArray:
-    """The torques (steps * 2,) of the best greedy policy that one learner passes through."""
+    """The torques (steps * 2,) of the best of all greedy policies of one learner."""
     env = gym.make("kreps/Reaching-v0")
     found: list[tuple[float, FloatArray]] = []
 

@@ -1,4 +1,4 @@
-"""Writes what was measured: facts and numbers as JSON, the table as Markdown."""
+"""Writes measurements: numbers and provenance as JSON, a table as Markdown."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
 from kreps.versions import versions
 
-HEADINGS = ("work", "size", "CPU s", "MB", "number", "of what", "asked for", "met")
+HEADINGS = ("work", "size", "CPU s", "MB", "number", "unit", "limit", "met")
 
 
 def facts(command: str) -> dict[str, Any]:
-    """What the numbers depend on beyond the code."""
+    """The machine, libraries and commit that the numbers depend on."""
     blas = [
         {
             key: library[key]
@@ -68,7 +68,7 @@ def rows(done: Sequence[Measured], peak: float) -> list[dict[str, Any]]:
             "at_most": criterion.at_most,
             "met": (criterion.at_least is None or number >= criterion.at_least)
             and (criterion.at_most is None or number <= criterion.at_most)
-            if _asked(criterion.at_least, criterion.at_most)
+            if _limit(criterion.at_least, criterion.at_most)
             else None,
             **measured.details,
         }
@@ -77,13 +77,13 @@ def rows(done: Sequence[Measured], peak: float) -> list[dict[str, Any]]:
     ]
 
 
-def _asked(at_least: float | None, at_most: float | None) -> str:
+def _limit(at_least: float | None, at_most: float | None) -> str:
     parts = [] if at_least is None else [f">= {at_least:g}"]
     return ", ".join(parts if at_most is None else [*parts, f"<= {at_most:g}"])
 
 
 def table(found: Sequence[dict[str, Any]]) -> str:
-    """The rows as people read them."""
+    """The rows as a Markdown table."""
     return markdown(
         HEADINGS,
         [
@@ -94,7 +94,7 @@ def table(found: Sequence[dict[str, Any]]) -> str:
                 "" if row["memory_bytes"] is None else f"{row['memory_bytes'] / 1e6:.3g}",
                 f"{row['number']:.3g}",
                 row["of_what"],
-                _asked(row["at_least"], row["at_most"]),
+                _limit(row["at_least"], row["at_most"]),
                 {True: "yes", False: "**no**", None: ""}[row["met"]],
             )
             for row in found
@@ -103,7 +103,7 @@ def table(found: Sequence[dict[str, Any]]) -> str:
 
 
 def stages(done: Sequence[Measured]) -> str:
-    """CPU seconds by stage, of those that have stages."""
+    """A table of CPU seconds by stage, for the benchmarks that have stages."""
     staged = [measured for measured in done if "stages" in measured.details]
     names = list(staged[0].details["stages"]) if staged else []
     return markdown(
@@ -115,7 +115,7 @@ def stages(done: Sequence[Measured]) -> str:
     )
 
 
-def in_words(about: dict[str, Any], peak: Peak) -> str:
+def description(about: dict[str, Any], peak: Peak) -> str:
     libraries = ", ".join(
         f"{b['internal_api']} {b['version']} for {b['architecture']} with {b['num_threads']} "
         f"thread{'s' if b['num_threads'] > 1 else ''}"
@@ -129,7 +129,7 @@ def in_words(about: dict[str, Any], peak: Peak) -> str:
 
 
 def write(folder: Path, done: Sequence[Measured], peak: Peak, command: str) -> None:
-    """``benchmarks.json`` and ``benchmarks.md`` in ``folder``."""
+    """Write ``benchmarks.json`` and ``benchmarks.md`` into ``folder``."""
     about = facts(command)
     found = rows(done, peak.best)
     content = {
@@ -141,5 +141,5 @@ def write(folder: Path, done: Sequence[Measured], peak: Peak, command: str) -> N
     folder.mkdir(exist_ok=True)
     (folder / "benchmarks.json").write_text(json.dumps(content, indent=1) + "\n")
     (folder / "benchmarks.md").write_text(
-        f"{in_words(about, peak)}\n\n{table(found)}\n\n{stages(done)}\n"
+        f"{description(about, peak)}\n\n{table(found)}\n\n{stages(done)}\n"
     )

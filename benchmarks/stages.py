@@ -1,4 +1,4 @@
-"""Where the time of an update goes: a picture from result files.
+"""Draws the time of each stage of an update, from result files.
 
     python benchmarks/stages.py
 

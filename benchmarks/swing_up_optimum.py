@@ -1,10 +1,10 @@
-"""The optimum of the swing-up by dynamic programming: the line that learners are measured against.
+"""Optimum of the swing-up by dynamic programming: a reference for learners.
 
     python benchmarks/swing_up_optimum.py --angles 241 --velocities 241
 
 Value iteration on a grid over angle and velocity, with the true dynamics, bilinear interpolation
-and Gauss-Hermite quadrature over the torque noise; then the greedy policy on that value function is
-evaluated like any learnt policy.  Writes ``results/swing-up-optimum.json``.
+and Gauss-Hermite quadrature over the torque noise.  The greedy policy of the value function is then
+evaluated in the same way as learnt policies.  Writes ``results/swing-up-optimum.json``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from kreps.learning.evaluate import evaluate
 from kreps.versions import versions
 
 RESTART = 0.02
-MAX_VELOCITY = 25.0  # rad/s; beyond it the grid's edge stands for all
+MAX_VELOCITY = 25.0  # rad/s; larger velocities get the value at the edge of the grid
 TORQUES = np.linspace(-swing_up.MAX_TORQUE, swing_up.MAX_TORQUE, 31)
 NODES, NODE_WEIGHTS = np.polynomial.hermite_e.hermegauss(7)
 NODE_WEIGHTS = NODE_WEIGHTS / NODE_WEIGHTS.sum()
@@ -35,7 +35,7 @@ NODE_WEIGHTS = NODE_WEIGHTS / NODE_WEIGHTS.sum()
 
 @dataclass(frozen=True)
 class Grid:
-    """Angles over a whole turn (periodic) times velocities."""
+    """Grid of angles over a whole turn (periodic) and velocities."""
 
     angles: int
     velocities: int
@@ -46,7 +46,7 @@ class Grid:
         return np.stack([a.ravel() for a in np.meshgrid(theta, velocity, indexing="ij")], axis=1)
 
     def interpolation(self, theta: FloatArray, velocity: FloatArray) -> sparse.csr_matrix:
-        """Rows of bilinear weights (m, grid points)."""
+        """Bilinear weights (m, grid points) of the grid points for m states."""
         x = theta / (2 * np.pi) * self.angles
         y = (np.clip(velocity / MAX_VELOCITY, -1, 1) + 1) / 2 * (self.velocities - 1)
         i, j = np.floor(x), np.minimum(np.floor(y), self.velocities - 2)
@@ -59,7 +59,7 @@ class Grid:
         return total
 
     def expectation(self, states: FloatArray, torque: FloatArray | float) -> sparse.csr_matrix:
-        """Weights of the successor's expected value over the torque noise."""
+        """Weights (m, grid points) of the successor's value, expected over the torque noise."""
         total = None
         for node, weight in zip(NODES, NODE_WEIGHTS, strict=True):
             successor = swing_up.integrate(*states.T, torque + swing_up.NOISE * node)
@@ -70,7 +70,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class GreedyOnGrid:
-    """One step of look-ahead on the grid's value function."""
+    """Greedy one-step look-ahead with the value function on the grid."""
 
     grid: Grid
     value: FloatArray

@@ -1,6 +1,7 @@
-"""Writes the tables of `results/` into the pages that show them: `make tables`.
+"""Writes the tables of ``results/`` into the documentation pages: ``make tables``.
 
-Between ``<!-- results: NAME -->`` and ``<!-- end of results -->`` a page shows results/NAME.md.
+The text between ``<!-- results: NAME -->`` and ``<!-- end of results -->`` is a copy of
+``results/NAME.md``.
 """
 
 from __future__ import annotations
@@ -13,7 +14,10 @@ SHOWN = re.compile(r"(<!-- results: (.+?) -->\n)(.*?)\n?(<!-- end of results -->
 
 
 def filled(text: str, results: Path = ROOT / "results") -> str:
-    """The text with every table that there is a result file for."""
+    """The text with its tables replaced by those of the result files.
+
+    A table without a result file is removed.
+    """
 
     def table(match: re.Match[str]) -> str:
         path = results / f"{match[2]}.md"
