@@ -1,4 +1,4 @@
-"""The learner as its user meets it, and how near it comes to a known optimum."""
+"""The public interface of learners, and a linear-quadratic problem with a known optimum."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from scipy.linalg import solve_discrete_are
 
 import kreps
-from kreps.data.rollouts import Rollout
+from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import FloatArray
@@ -34,14 +34,14 @@ def swing_up(seed: int = 0, **settings: Any) -> kreps.KREPS:
 
 @pytest.fixture(scope="module")
 def learnt() -> kreps.KREPS:
-    """After two iterations.  Tests must not learn on with it."""
+    """After two iterations.  Tests must not change it."""
     return swing_up().learn(2, progress=False)
 
 
 # ---- learning ---------------------------------------------------------------------------------
 
 
-def test_a_plain_gymnasium_environment_is_learnt_in_unchanged() -> None:
+def test_any_gymnasium_environment_can_be_learnt_in() -> None:
     learner = kreps.KREPS(gym.make("Pendulum-v1"), seed=0, **TINY)
     assert learner.learn(2, progress=False) is learner
     assert learner.state.iteration == 2
@@ -51,8 +51,8 @@ def test_a_plain_gymnasium_environment_is_learnt_in_unchanged() -> None:
     assert action.shape == (1,) and np.abs(action) <= 2.0
 
 
-def collected(learner: kreps.KREPS, policy: StochasticPolicy, iteration: int) -> list[Rollout]:
-    """What `learn` collects for an update, with `TINY`."""
+def collected(learner: kreps.KREPS, policy: StochasticPolicy, iteration: int) -> Rollouts:
+    """The rollouts that `learn` collects for an update, with `TINY`."""
     assert learner.env is not None
     return collect(
         learner.env,
@@ -62,37 +62,36 @@ def collected(learner: kreps.KREPS, policy: StochasticPolicy, iteration: int) ->
         seed=0,
         iteration=iteration,
         restart_probability=0.02,
-        stratified=learner.settings.restarts == "stratified",
+        stratified=learner.settings.rollout_lengths == "stratified",
     )
 
 
-def test_counts_are_exact_and_the_window_forgets(learnt: kreps.KREPS) -> None:
+def test_counts_include_forgotten_rollouts(learnt: kreps.KREPS) -> None:
     state = learnt.state
     assert (state.iteration, state.rollouts) == (2, 9)
     assert len(state.window.rollouts) == 6
     first = collected(learnt, BangBang(learnt.task), 0)
-    newest = sum(len(r) for r in state.window.rollouts[3:])
-    assert state.steps == sum(len(r) for r in first) + newest
+    assert state.steps == first.steps + state.window.rollouts[3:].steps
     for mine, theirs in zip(state.window.rollouts[:3], first[3:], strict=True):
         np.testing.assert_array_equal(mine.actions, theirs.actions)
 
 
-@pytest.mark.parametrize(("exploration", "kind"), [("bang-bang", BangBang), ("gaussian", Gaussian)])
-def test_the_first_policy_is_the_one_asked_for(exploration: str, kind: Any) -> None:
-    learner = swing_up(exploration=exploration, exploration_scale=0.5)
+@pytest.mark.parametrize(("noise", "kind"), [("bang-bang", BangBang), ("gaussian", Gaussian)])
+def test_the_first_policy_is_that_of_the_settings(noise: Any, kind: Any) -> None:
+    learner = swing_up(exploration=kreps.Exploration(noise, 0.5))
     learner.learn(1, progress=False)
-    actions = np.concatenate([r.actions for r in learner.state.window.rollouts])
+    actions = learner.state.window.rollouts.actions
     if kind is BangBang:
         assert set(np.unique(actions)) == {-30.0, 30.0}
     else:
         assert actions.std() == pytest.approx(0.5 * 30.0, rel=0.2)
 
 
-def test_updates_from_foreign_data_need_no_environment(learnt: kreps.KREPS) -> None:
+def test_updates_from_given_rollouts_need_no_environment(learnt: kreps.KREPS) -> None:
     rollouts = learnt.state.window.rollouts
     learner = kreps.KREPS(TaskSpec(2, [-30.0], [30.0], (0,)), seed=0, **TINY)
     info = learner.update(list(rollouts))
-    assert info.samples == sum(len(r) for r in rollouts)
+    assert info.samples == rollouts.steps
     assert learner.state.iteration == 1 and learner.state.rollouts == 6
     assert info.dual.kl <= learner.settings.kl_bound * (1 + 1e-3)
     action, _ = learner.policy.predict([3.0, 0.0], deterministic=True)
@@ -116,24 +115,24 @@ def test_learn_is_collect_and_update(learnt: kreps.KREPS) -> None:
     )
 
 
-def test_learning_without_an_environment_says_what_to_do() -> None:
+def test_learning_without_an_environment_raises_with_a_remedy() -> None:
     learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]))
-    with pytest.raises(ConfigurationError, match=r"no environment.*update\(rollouts\)"):
+    with pytest.raises(ConfigurationError, match=r"no environment.*update\(\)"):
         learner.learn(1)
 
 
-def test_nothing_learnt_yet_is_said_so() -> None:
+def test_results_before_the_first_update_raise() -> None:
     learner = swing_up()
-    for ask in (
+    for result in (
         lambda: learner.policy,
         lambda: learner.value_function,
         lambda: learner.predict([0.0, 0.0]),
     ):
-        with pytest.raises(ConfigurationError, match="learnt yet"):
-            ask()
+        with pytest.raises(ConfigurationError, match="before the first update"):
+            result()
 
 
-def test_learning_again_goes_on_where_it_stopped(learnt: kreps.KREPS) -> None:
+def test_a_second_call_of_learn_continues_the_first(learnt: kreps.KREPS) -> None:
     learner = swing_up().learn(1, progress=False).learn(1, progress=False)
     assert learner.state.iteration == 2
     np.testing.assert_array_equal(
@@ -150,7 +149,7 @@ def test_an_update_is_bounded_in_kl_for_each_bound() -> None:
         assert reports[0].update.dual.kl == pytest.approx(bound, rel=1e-3)
 
 
-# ---- same seed, same bytes --------------------------------------------------------------------
+# ---- reproducibility --------------------------------------------------------------------------
 
 
 def test_same_seed_same_bytes_and_another_seed_another_policy(
@@ -181,7 +180,7 @@ def test_neither_global_randomness_nor_predicting_changes_what_is_learnt(
 # ---- callbacks --------------------------------------------------------------------------------
 
 
-def test_callbacks_are_called_in_order_and_told_what_happened() -> None:
+def test_callbacks_are_called_in_order_with_a_report() -> None:
     calls: list[tuple[str, int]] = []
     reports: list[IterationReport] = []
 
@@ -201,20 +200,20 @@ def test_callbacks_are_called_in_order_and_told_what_happened() -> None:
     assert [r.rollouts for r in reports] == [6, 9, 12]
     new = learner.state.window.rollouts[-3:]
     assert reports[-1].average_reward == pytest.approx(
-        np.concatenate([r.rewards for r in new]).mean()
+        np.concatenate([r.rewards for r in new]).mean(), rel=1e-12
     )
-    assert reports[-1].steps - reports[-2].steps == sum(len(r) for r in new)
+    assert reports[-1].steps - reports[-2].steps == new.steps
     for report in reports:
         assert report.update.dual.kl <= 1.0 + 1e-3
         assert report.rollout_seconds >= 0
         assert {"basis", "embedding", "dual", "policy"} <= set(report.update.seconds)
-        # of the last step, in states that the model leads to
+        # of the model-based step: the samples and as many states of model rollouts
         weighted = 2 * report.update.samples
         assert len(report.update.dual.weights) == weighted
         assert 1.0 <= report.update.effective_samples <= weighted
 
 
-def test_a_callback_that_returns_false_ends_the_learning_after_all_were_called() -> None:
+def test_a_callback_that_returns_false_stops_learning_after_all_were_called() -> None:
     seen: list[int] = []
 
     def stop(learner: kreps.KREPS, report: IterationReport) -> bool:
@@ -229,7 +228,7 @@ def test_a_callback_that_returns_false_ends_the_learning_after_all_were_called()
     assert seen == [1, 2]
 
 
-def test_a_callback_that_raises_leaves_what_was_learnt() -> None:
+def test_an_exception_in_a_callback_keeps_the_update() -> None:
     def fail(learner: kreps.KREPS, report: IterationReport) -> None:
         raise RuntimeError("disk full")
 
@@ -241,7 +240,7 @@ def test_a_callback_that_raises_leaves_what_was_learnt() -> None:
     assert learner.state.iteration == 2
 
 
-def test_progress_prints_a_line_per_iteration_where_there_is_no_terminal(
+def test_progress_prints_a_line_per_iteration_without_a_terminal(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     learner = swing_up().learn(2)
@@ -272,7 +271,7 @@ def test_predict_takes_one_observation_or_a_batch(learnt: kreps.KREPS) -> None:
     )
 
 
-def test_predict_of_an_empty_batch_is_empty_without_complaint(
+def test_predict_of_an_empty_batch_is_empty_without_a_warning(
     learnt: kreps.KREPS, recwarn: pytest.WarningsRecorder
 ) -> None:
     actions, _ = learnt.policy.predict(np.empty((0, 2)), deterministic=True)
@@ -294,8 +293,8 @@ def test_stochastic_prediction_has_the_moments_of_the_policy(learnt: kreps.KREPS
     candidates = np.stack([rng.uniform(-1.5, 4.7, 500), rng.uniform(-8, 8, 500)], axis=1)
     mean = policy.process.mean(candidates)[:, 0]
     spread = policy.process.standard_deviation(candidates)[:, 0]
-    inside = np.flatnonzero(np.abs(mean) + 3 * spread < 30.0)  # where clipping does not matter
-    if len(inside) == 0:  # none: then least clipped, and compare the clipped distribution
+    inside = np.flatnonzero(np.abs(mean) + 3 * spread < 30.0)  # clipping does not matter
+    if len(inside) == 0:  # otherwise where it matters least
         inside = np.array([np.argmin(np.abs(mean) + 3 * spread)])
     i = inside[0]
     draws = policy.predict(np.tile(candidates[i], (4000, 1)))[0][:, 0]
@@ -304,14 +303,14 @@ def test_stochastic_prediction_has_the_moments_of_the_policy(learnt: kreps.KREPS
     assert draws.std() == pytest.approx(expected.std(), rel=0.06)
 
 
-def test_stochastic_prediction_draws_anew_each_time(learnt: kreps.KREPS) -> None:
+def test_stochastic_prediction_differs_from_call_to_call(learnt: kreps.KREPS) -> None:
     policy = learnt.policy
-    # most of them may be clipped
+    # most of them may be equal, as they are clipped
     actions = [float(policy.predict([np.pi, 0.0])[0][0]) for _ in range(300)]
     assert len(set(actions)) > 3
 
 
-def test_the_predict_of_the_learner_draws_anew_each_time_too(learnt: kreps.KREPS) -> None:
+def test_predict_of_the_learner_differs_from_call_to_call_too(learnt: kreps.KREPS) -> None:
     actions = [float(learnt.predict([np.pi, 0.0])[0][0]) for _ in range(300)]
     assert len(set(actions)) > 3
 
@@ -319,7 +318,7 @@ def test_the_predict_of_the_learner_draws_anew_each_time_too(learnt: kreps.KREPS
 def test_actions_are_clipped_to_the_limits(learnt: kreps.KREPS) -> None:
     states = np.tile([np.pi, 0.0], (2000, 1))
     actions, _ = learnt.policy.predict(states)
-    assert np.abs(actions).max() == 30.0  # noise is large after two iterations: some are clipped
+    assert np.abs(actions).max() == 30.0  # the noise is still large, so that some are clipped
     assert np.abs(actions).min() < 30.0
 
 
@@ -339,9 +338,7 @@ def test_actions_are_clipped_to_the_limits(learnt: kreps.KREPS) -> None:
         {"theta": 1.0},
     ],
 )
-def test_observations_without_a_safe_action_are_refused(
-    learnt: kreps.KREPS, observation: Any
-) -> None:
+def test_invalid_observations_raise(learnt: kreps.KREPS, observation: Any) -> None:
     with pytest.raises(DataError, match="observation"):
         learnt.policy.predict(observation)
 
@@ -354,14 +351,14 @@ def test_predictions_far_from_all_data_are_finite(learnt: kreps.KREPS) -> None:
             assert np.isfinite(actions).all() and np.abs(actions).max() <= 30.0
 
 
-def test_an_outlier_in_a_batch_does_not_change_the_actions_beside_it(learnt: kreps.KREPS) -> None:
+def test_an_outlier_in_a_batch_does_not_change_other_actions(learnt: kreps.KREPS) -> None:
     alone, _ = learnt.policy.predict([3.0, 0.5], deterministic=True)
     for far in (1e5, 1e10, 1e100):
         batch, _ = learnt.policy.predict([[3.0, 0.5], [0.0, far]], deterministic=True)
         assert batch[0, 0] == pytest.approx(alone[0], abs=1e-4)
 
 
-# ---- what cannot be served --------------------------------------------------------------------
+# ---- invalid arguments ------------------------------------------------------------------------
 
 
 def test_an_unknown_keyword_names_the_valid_ones() -> None:
@@ -379,7 +376,7 @@ def test_an_unknown_keyword_names_the_valid_ones() -> None:
         ({"seed": -1}, "seed"),
         ({"seed": 1.5}, "seed"),
         ({"seed": True}, "seed"),
-        ({"recipe": "printed"}, "recipe"),
+        ({"preset": "printed"}, "preset"),
         ({"kl_bound": 0.0}, "kl_bound"),
         ({"kl_bound": float("nan")}, "kl_bound"),
         ({"window": 2.5}, "window"),
@@ -387,7 +384,7 @@ def test_an_unknown_keyword_names_the_valid_ones() -> None:
         ({"restart_probability": 1.0}, "restart_probability"),
     ],
 )
-def test_impossible_arguments_are_named(arguments: dict[str, Any], says: str) -> None:
+def test_invalid_arguments_are_named(arguments: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigurationError, match=says):
         kreps.KREPS(gym.make("kreps/SwingUp-v0"), **arguments)
 
@@ -400,14 +397,19 @@ def _rollout(ds: int = 2, da: int = 1) -> Rollout:
 @pytest.mark.parametrize(
     ("rollouts", "says"),
     [
-        (lambda: [], "no new roll-out"),
+        (lambda: [], "no new rollout"),
         (lambda: [_rollout(ds=3)], "3 observation"),
-        (lambda: [_rollout(), _rollout(da=2)], "2 action"),
-        (lambda: [np.zeros((3, 2))], "item 0 is a ndarray, not a kreps.Rollout"),
+        (lambda: [_rollout(da=2)], "2 action"),
+        (
+            lambda: [_rollout(), _rollout(da=2)],
+            r"rollout 1 has .*\(2, 2\), those before it \(2, 1\)",
+        ),
+        (lambda: _rollout(), r"write \[rollout\]"),
+        (lambda: [np.zeros((3, 2))], r"item 0 is a ndarray, not a kreps\.Rollout"),
         (lambda: [_rollout(), None], "item 1 is a NoneType"),
     ],
 )
-def test_unusable_rollouts_are_refused_and_change_nothing(
+def test_invalid_rollouts_raise_and_leave_the_learner_unchanged(
     rollouts: Callable[[], list[Any]], says: str
 ) -> None:
     learner = swing_up()
@@ -430,7 +432,7 @@ NOISE, START, START_SPREAD = 0.1, np.array([1.0, 0.0]), 0.2
 
 
 class DoubleIntegrator(gym.Env[Any, Any]):
-    """A mass pushed by a force, quadratic cost, noise on the velocity; the force limit is ample."""
+    """A mass under a force, with quadratic cost, noise on the velocity and wide force limits."""
 
     def __init__(self) -> None:
         self.observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
@@ -458,7 +460,7 @@ class LinearFeedback:
 
 
 def optimum() -> tuple[FloatArray, float]:
-    """Gain and average reward of the restarting chain: a Riccati equation discounted by 1 - p."""
+    """Gain and average reward of the process with restarts, by a discounted Riccati equation."""
     root = math.sqrt(GAMMA)
     cost = solve_discrete_are(root * A, root * B, Q, R)
     gain = np.linalg.solve(R + GAMMA * B.T @ cost @ B, GAMMA * B.T @ cost @ A)
@@ -467,7 +469,7 @@ def optimum() -> tuple[FloatArray, float]:
     return gain, float(-P * np.trace(cost @ start) - GAMMA * np.trace(cost @ noise))
 
 
-def earned(task: TaskSpec, policy: StochasticPolicy) -> float:
+def average_reward(task: TaskSpec, policy: StochasticPolicy) -> float:
     return evaluate(
         DoubleIntegrator(), task, policy, restart_probability=P, episodes=200, steps=150, seed=1
     ).mean
@@ -476,41 +478,43 @@ def earned(task: TaskSpec, policy: StochasticPolicy) -> float:
 def test_evaluation_agrees_with_the_riccati_equation() -> None:
     gain, best = optimum()
     task = TaskSpec(2, [-4.0], [4.0])
-    assert earned(task, LinearFeedback(gain)) == pytest.approx(best, rel=0.03)
-    for factor in (0.5, 2.0):  # and no other gain is better
-        assert earned(task, LinearFeedback(factor * gain)) < 1.05 * best
+    assert average_reward(task, LinearFeedback(gain)) == pytest.approx(best, rel=0.03)
+    for factor in (0.5, 2.0):  # other gains are worse
+        assert average_reward(task, LinearFeedback(factor * gain)) < 1.05 * best
 
 
-@pytest.mark.parametrize("recipe", ["default", "observed"])
-def test_the_learner_comes_near_the_optimum_of_a_linear_quadratic_problem(
-    recipe: str,
+@pytest.mark.parametrize("preset", ["model_based", "single_step"])
+def test_the_learnt_policy_is_near_the_optimum_of_a_linear_quadratic_problem(
+    preset: str,
 ) -> None:
-    # Measured over seeds 0 to 7: with the recipe "observed" the cost is 1.02 to 1.07 of the
-    # optimum.  With the default it is 1.01 to 1.05 for seven, 1.28 for one.
-    # The first policy costs 54 times the optimum, doing nothing 4.6.
+    # Measured with seeds 0 to 7: with the preset "single_step" the cost is 1.02 to 1.07 of the
+    # optimum.  With "model_based" it is 1.01 to 1.05 for seven of them, 1.28 for one.
+    # The cost of the first policy is 54 times the optimum, that of zero actions 4.6.
     _, best = optimum()
     shares = []
     for seed in range(5):
         learner = kreps.KREPS(
             DoubleIntegrator(),
             seed=seed,
-            recipe=recipe,
+            preset=preset,
             restart_probability=P,
-            exploration="gaussian",
+            exploration=kreps.Exploration("gaussian"),
             initial_rollouts=40,
             rollouts_per_iteration=20,
             window=40,
         )
         learner.learn(10, progress=False)
         assert learner.state.policy is not None
-        shares.append(earned(learner.task, Greedy(learner.state.policy)) / best)
-    first = earned(TaskSpec(2, [-4.0], [4.0]), Gaussian(TaskSpec(2, [-4.0], [4.0]), 1.0)) / best
-    assert sorted(shares)[3] < (1.15 if recipe == "observed" else 1.25)  # at least four of five
+        shares.append(average_reward(learner.task, Greedy(learner.state.policy)) / best)
+    first = (
+        average_reward(TaskSpec(2, [-4.0], [4.0]), Gaussian(TaskSpec(2, [-4.0], [4.0]), 1.0)) / best
+    )
+    assert sorted(shares)[3] < (1.15 if preset == "single_step" else 1.25)  # at least four of five
     assert max(shares) < 1.5
     assert first > 10 * max(shares)
 
 
-def test_what_contradicts_itself_is_refused() -> None:
+def test_contradicting_arguments_raise() -> None:
     task = kreps.TaskSpec(2, [-1.0], [1.0])
     with pytest.raises(ConfigurationError, match="periodic"):
         kreps.KREPS(task, periodic=(0,))
@@ -520,19 +524,19 @@ def test_what_contradicts_itself_is_refused() -> None:
         kreps.KREPS(restarting, restart_probability=0.02)
     with pytest.raises(ConfigurationError, match="threads"):
         kreps.KREPS(task, threads="many")  # type: ignore[arg-type]
-    for stranger in ("Pendulum-v1", None, 3):
+    for no_environment in ("Pendulum-v1", None, 3):
         with pytest.raises(ConfigurationError, match="gymnasium"):
-            kreps.KREPS(stranger)  # type: ignore[arg-type]
+            kreps.KREPS(no_environment)  # type: ignore[arg-type]
 
 
-def test_settings_can_be_given_whole() -> None:
+def test_a_preset_can_be_a_settings_object() -> None:
     settings = kreps.Settings(kl_bound=0.3, window=7)
     task = kreps.TaskSpec(2, [-1.0], [1.0])
-    assert kreps.KREPS(task, recipe=settings).settings == settings
-    assert kreps.KREPS(task, recipe=settings, window=9).settings.window == 9
+    assert kreps.KREPS(task, preset=settings).settings == settings
+    assert kreps.KREPS(task, preset=settings, window=9).settings.window == 9
 
 
-def test_the_share_of_clipped_actions_is_of_the_new_roll_outs() -> None:
+def test_the_fraction_of_clipped_actions_is_of_the_new_rollouts() -> None:
     rng = np.random.default_rng(4)
 
     def fresh(scale: float) -> Rollout:
@@ -543,11 +547,12 @@ def test_the_share_of_clipped_actions_is_of_the_new_roll_outs() -> None:
     assert learner.update([fresh(2.0)]).clipped == 1.0
 
 
-def test_a_batch_larger_than_the_window_is_counted_whole() -> None:
+def test_rollouts_beyond_the_window_are_counted_but_not_kept() -> None:
     rng = np.random.default_rng(5)
     batch = [Rollout(rng.standard_normal((9, 2)), np.zeros((8, 1)), np.zeros(8)) for _ in "abc"]
     learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]), window=2)
     info = learner.update(batch)
     assert info.samples == 16
     assert (learner.state.rollouts, learner.state.steps) == (3, 24)
-    assert learner.state.window.rollouts == tuple(batch[1:])
+    kept = learner.state.window.rollouts
+    np.testing.assert_array_equal(kept.points, np.concatenate([r.observations for r in batch[1:]]))

@@ -1,4 +1,4 @@
-"""What importing costs, what it loads, and how fast the control loop is."""
+"""Cost of importing, public names, and speed of the control loop."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def printed(code: str) -> str:
 
 
 def test_importing_takes_less_than_600_ms_of_cpu() -> None:
-    # the interpreter's own start counts too; the least of three, as the machine may be shared
+    # with the start of the interpreter; the smallest of three, as the machine may be shared
     code = "import kreps, time; print(time.process_time())"
     assert min(float(printed(code)) for _ in range(3)) < 0.6
 
 
-def test_importing_loads_neither_pictures_nor_scipy() -> None:
+def test_importing_loads_neither_plotting_nor_scipy() -> None:
     code = f"import kreps, sys; print([m for m in {LAZY!r} if m in sys.modules])"
     assert printed(code) == "[]"
 
@@ -38,12 +38,12 @@ def test_importing_loads_neither_pictures_nor_scipy() -> None:
 def test_importing_registers_the_environments() -> None:
     code = "import gymnasium as gym, kreps; print(gym.make('kreps/SwingUp-v0').reset(seed=0)[0])"
     assert printed(code).startswith("[3.14")
-    # Gymnasium's own way to name a module that registers
+    # with the module that registers it, as Gymnasium has it
     code = "import gymnasium as gym; print(gym.make('kreps:kreps/SwingUp-v0').reset(seed=0)[0])"
     assert printed(code).startswith("[3.14")
 
 
-def test_learning_needs_no_pictures() -> None:
+def test_learning_does_not_load_plotting() -> None:
     code = """
 import gymnasium as gym, kreps, sys
 learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), initial_rollouts=3)
@@ -57,13 +57,13 @@ def test_every_public_name_exists_and_is_documented() -> None:
     assert len(set(kreps.__all__)) == len(kreps.__all__)
     assert set(kreps.__all__) <= set(dir(kreps))
     for name in kreps.__all__:
-        thing = getattr(kreps, name)
-        assert name == "PRESETS" or thing.__doc__
+        public = getattr(kreps, name)
+        assert name == "PRESETS" or public.__doc__
     with pytest.raises(AttributeError, match="Nothing"):
         _ = kreps.Nothing
 
 
-def test_all_errors_are_of_one_tree() -> None:
+def test_all_errors_derive_from_one() -> None:
     errors = [getattr(kreps, n) for n in kreps.__all__ if n.endswith(("Error", "Failure"))]
     assert len(errors) >= 7
     assert all(issubclass(error, kreps.KrepsError) for error in errors)
