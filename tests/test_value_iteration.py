@@ -550,7 +550,7 @@ def test_an_environment_in_an_unknown_wrapper_is_refused() -> None:
 
 
 def test_too_many_points_are_refused_with_their_number() -> None:
-    with pytest.raises(ConfigurationError, match=r"2500 points, the limit is 2499"):
+    with pytest.raises(ConfigurationError, match=r"2500 points, but at most 2499 are allowed"):
         grid_of(Counter(), None, 25, 4, most=2499)
     assert len(grid_of(Counter(), None, 25, 4, most=2500)) == 2500
 
