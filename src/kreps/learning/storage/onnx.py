@@ -1,9 +1,10 @@
-"""Policies as ONNX models: mean and standard deviation where there is no Python.
+"""Policies as ONNX models, which give mean and standard deviation of the actions without Python.
 
-A model computes what `SparseGP` computes.  Kernel values come from differences of coordinates, not
-from inner products as in `kernels.gaussian_gram`: those cost less in large batches, but lose up to
-``|e|^2`` roundings in the exponent.  Single precision has none to spare: weights are large, of
-alternating sign, and multiply each error of a kernel value.
+A model computes the same as `SparseGP`.  Kernel values are computed from differences of
+coordinates, not from inner products as in `kreps.kernels.gram.gaussian_gram`: inner products are
+faster in large batches, but their rounding errors in the exponent are up to ``|e|^2`` times as
+large.  In single precision that would be too much, as weights are large, of alternating sign, and
+multiply each error of a kernel value.
 """
 
 from __future__ import annotations
@@ -24,39 +25,44 @@ from kreps.learning.storage.files import write_atomically
 from kreps.policies.sparse_gp import SparseGP
 
 OPSET, IR_VERSION = 17, 8
-"""Of 2022, so that runtimes on robots need not be new."""
+"""Versions of 2022, so that older runtimes on robots can read a model."""
 
 Number = type[np.floating[Any]]
 DTYPES: dict[str, Number] = {"float64": np.float64, "float32": np.float32}
 
 SINGLE_PRECISION_TOLERANCE = 1e-4
-"""Largest error of the mean, in units of the action scale, that is left to single precision."""
+"""Largest error of the mean that single precision may cause, in units of the action scale."""
 
 
-def write_onnx(policy: SparseGP, path: Path, dtype: str = "float64") -> str:
-    """Write a model of ``policy`` with opset 17 of ONNX; the same policy gives the same bytes.
+def write_onnx(
+    policy: SparseGP,
+    path: Path,
+    dtype: str = "float64",
+    tolerance: float = SINGLE_PRECISION_TOLERANCE,
+) -> str:
+    """Write a model of a policy with opset 17 of ONNX; the same policy gives the same bytes.
 
     Input ``observation`` (batch, ds).  Outputs ``action`` (batch, da), the mean clipped to the
     task's limits, and ``standard_deviation`` (batch, da) of the commanded action, both in the
     task's units.  A batch needs memory for batch x centres x coordinates numbers.  A model cannot
-    refuse an observation: NaN comes out as NaN.
+    raise an error: an observation of NaN gives actions of NaN.
 
     Args:
         policy: r centres.
         path: the file to replace.
-        dtype: "float64" or "float32", of input and outputs.  What lies between them is of the
-            same type, unless `single_precision_error` is beyond `SINGLE_PRECISION_TOLERANCE`:
-            then it is float64.
+        dtype: "float64" or "float32", of input and outputs.  The arithmetic is of the same type,
+            unless `single_precision_error` is above the tolerance; then it is float64.
+        tolerance: of the mean, in units of the action scale.
 
     Returns:
-        The type of what lies between.
+        The type of the arithmetic.
 
     Raises:
         ConfigurationError: ONNX is not installed, or another dtype, or numbers of the policy are
             too large for it.
         StorageError: the file cannot be written.
     """
-    if dtype not in tuple(DTYPES):  # it may be of any type
+    if dtype not in tuple(DTYPES):  # a tuple, as dtype may not be hashable
         raise ConfigurationError(
             f"dtype = {dtype!r:.40}, but a model is computed in one of {', '.join(DTYPES)}"
         )
@@ -66,9 +72,9 @@ def write_onnx(policy: SparseGP, path: Path, dtype: str = "float64") -> str:
         raise ConfigurationError(
             f"writing {path} needs ONNX, which is not installed: pip install 'kreps[onnx]'"
         ) from error
-    single = single_precision_error(policy) <= SINGLE_PRECISION_TOLERANCE
+    single = single_precision_error(policy) <= tolerance
     arithmetic = dtype if single else "float64"
-    with np.errstate(over="ignore"):  # refused by name in `constant`
+    with np.errstate(over="ignore"):  # `_Graph.constant` raises an error with the name
         graph = _graph_of(policy, onnx.helper, DTYPES[dtype], DTYPES[arithmetic])
     model = onnx.helper.make_model(
         graph,
@@ -87,11 +93,11 @@ def write_onnx(policy: SparseGP, path: Path, dtype: str = "float64") -> str:
 
 
 def single_precision_error(policy: SparseGP) -> float:
-    """What single precision does to the mean, estimated from above, in units of the action scale.
+    """Upper estimate of the error of the mean in single precision, in units of the action scale.
 
-    A kernel value ``k_j`` is off by a few parts in 2^24, so the mean by that much of
-    ``sum_j k_j |w_j|``, which is largest near the centres.  Measured errors were less
-    than half of this.
+    The relative error of a kernel value ``k_j`` is a few times 2^-24.  The error of the mean is
+    then that much of ``sum_j k_j |w_j|``, which is largest near the centres.  Measured errors were
+    less than half of this estimate.
     """
     k = policy.kernel.gram(policy.states)
     magnitude = float((k @ np.abs(policy.mean_weights)).max(initial=0.0))
@@ -99,7 +105,7 @@ def single_precision_error(policy: SparseGP) -> float:
 
 
 def _note(policy: SparseGP, arithmetic: str) -> str:
-    """What a model is, for who finds it later."""
+    """The metadata of a model: version, kind of policy, arithmetic and task."""
     task = policy.task
     content = {
         "version": version("kreps"),
@@ -115,7 +121,7 @@ def _note(policy: SparseGP, arithmetic: str) -> str:
 
 
 class _Graph:
-    """Nodes and constants in the order in which they are asked for.
+    """Nodes and constants, in the order in which they are added.
 
     Attributes:
         dtype: of the arithmetic.
@@ -127,7 +133,7 @@ class _Graph:
         self.constants: list[Any] = []
 
     def constant(self, name: str, values: Any, dtype: Number | None = None) -> str:
-        """A tensor, of the dtype of the arithmetic unless another one is given."""
+        """Add a tensor, of the dtype of the arithmetic unless another one is given."""
         dtype = dtype or self.dtype
         array = np.asarray(values, dtype=np.float64).astype(dtype)
         if not np.isfinite(array).all():
@@ -148,11 +154,11 @@ class _Graph:
         return name
 
     def kind(self, dtype: Any) -> int:
-        """The number that ONNX gives to a dtype."""
+        """The number of a dtype in ONNX."""
         return int(self.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
 
     def node(self, operation: str, *inputs: str, out: str = "", **attributes: Any) -> str:
-        """The name of the node's output, ``out`` or one made up."""
+        """Add a node; the name of its output, ``out`` or a new one, is returned."""
         name = out or f"{operation.lower()}_{len(self.nodes)}"
         self.nodes.append(self.helper.make_node(operation, inputs, [name], name=name, **attributes))
         return name
@@ -162,7 +168,7 @@ class _Graph:
 
 
 def _graph_of(policy: SparseGP, helper: Any, border: Number, arithmetic: Number) -> Any:
-    """From inputs of dtype ``border`` by ``arithmetic`` to outputs of dtype ``border``."""
+    """The graph with inputs and outputs of dtype ``border``, computed in ``arithmetic``."""
     graph, task = _Graph(helper, arithmetic), policy.task
     k = _kernel_values(graph, policy, graph.cast("observation", arithmetic))
 
@@ -203,8 +209,8 @@ def _kernel_values(graph: _Graph, policy: SparseGP, observation: str) -> str:
     kernel, states = policy.kernel, policy.states
     parts = [factor.coordinates(states) for factor in kernel.factors]
     raw = np.concatenate(parts, axis=1)
-    # The same rounded origin on both sides.  It is taken off before lengthscales are divided by:
-    # what is near the centres then keeps all its digits, wherever they lie.
+    # The same rounded origin is subtracted from states and centres, before the division by
+    # lengthscales: differences near the centres then keep all digits, wherever the centres lie.
     origin = raw.mean(axis=0).astype(graph.dtype)
     per_length = 1.0 / np.repeat(kernel.lengthscales, [part.shape[1] for part in parts])
     found = [
@@ -234,7 +240,7 @@ def _coordinates(graph: _Graph, factor: Factor, observation: str, name: str) -> 
         parts = [graph.node(operation, columns) for operation in ("Cos", "Sin")]
         return graph.node("Concat", *parts, axis=1)
     down, across = (smoothing(size) for size in factor.shape)
-    shape = graph.integers(f"{name}_shape", [0, *factor.shape])  # 0: as many as came in
+    shape = graph.integers(f"{name}_shape", [0, *factor.shape])  # 0: the size of the batch
     image = graph.node("Reshape", columns, shape)
     image = graph.node("MatMul", graph.constant(f"{name}_down", down), image)
     image = graph.node("MatMul", image, graph.constant(f"{name}_across", across.T))
@@ -244,7 +250,7 @@ def _coordinates(graph: _Graph, factor: Factor, observation: str, name: str) -> 
 
 
 def _inwards(limit: FloatArray, centre: FloatArray, dtype: Number) -> NDArray[Any]:
-    """``limit`` in ``dtype``, never farther from ``centre``: no action may lie beyond it."""
+    """``limit`` rounded to ``dtype`` towards ``centre``, so that no action is beyond it."""
     rounded = limit.astype(dtype)
     beyond = np.abs(rounded.astype(np.float64) - centre) > np.abs(limit - centre)
     return np.where(beyond, np.nextafter(rounded, centre.astype(dtype)), rounded)
