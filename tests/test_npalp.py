@@ -1,4 +1,4 @@
-"""NPALP: its fixed point against the linear program itself, and the policy made of it."""
+"""NPALP: its fixed point against the linear program, and its policy."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.optimize import linprog
 from scipy.spatial.distance import cdist
 
 from kreps.algorithms import npalp
-from kreps.algorithms.npalp import sample_bounds
+from kreps.algorithms.npalp import NPALPInfo, sample_bounds
 from kreps.algorithms.state import LearnerState
 from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
@@ -29,7 +29,7 @@ TASK = TaskSpec(2, [-2.0, 0.0], [2.0, 10.0], periodic=(0,))
 def rollouts_of(
     seed: int, count: int = 4, steps: int = 4, terminated: bool = False
 ) -> list[Rollout]:
-    """Points, actions and rewards at random; actions often beyond the limits."""
+    """Random points, actions and rewards; the actions are often beyond the limits."""
     rng = np.random.default_rng(seed)
     return [
         Rollout(
@@ -42,16 +42,16 @@ def rollouts_of(
     ]
 
 
-def learnt(rollouts: list[Rollout], **changes: float) -> LipschitzPolicy:
+def learn_policy(rollouts: list[Rollout], **changes: float) -> LipschitzPolicy:
     chosen = NPALPSettings(**changes)  # type: ignore[arg-type]
-    state = LearnerState(ReplayWindow(30))
+    state = LearnerState(ReplayWindow(TASK, 30))
     new, _ = npalp.update(state, rollouts, TASK, chosen, np.random.default_rng(0))
     assert isinstance(new.policy, LipschitzPolicy)
     return new.policy
 
 
-def made(fraction: float = 0.3, scale: float = 0.2, count: int = 40) -> LipschitzPolicy:
-    """A policy over samples at random."""
+def random_policy(fraction: float = 0.3, scale: float = 0.2, count: int = 40) -> LipschitzPolicy:
+    """A policy on random samples."""
     rng = np.random.default_rng(5)
     return LipschitzPolicy(
         task=TASK,
@@ -73,7 +73,7 @@ def linear_program(
     gamma: float,
     slope: float,
 ) -> FloatArray:
-    """V at all points: the program as it is printed, every pair of points a constraint."""
+    """V at all points: the program as printed, with a constraint per pair of points."""
     count = len(distances)
     left, right = [], []
     for s, after, reward in zip(state, successor, rewards, strict=True):
@@ -113,10 +113,10 @@ def test_the_bounds_solve_the_linear_program(seed: int, slope: float) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_an_update_solves_the_linear_program_of_its_window(seed: int) -> None:
     rollouts = rollouts_of(seed, 2) + rollouts_of(seed + 100, 2, terminated=True)
-    policy = learnt(rollouts, restart_probability=0.1, lipschitz=1.5)
+    policy = learn_policy(rollouts, restart_probability=0.1, lipschitz=1.5)
     data = Transitions.from_rollouts(rollouts)
     successor = data.successor.copy()
-    successor[[11, 15]] = 10, 15  # the real ends lead to their own start states
+    successor[[11, 15]] = 10, 15  # terminations lead to their own start states
     points = policy.kernel.embed(data.points)
     wanted = linear_program(
         cdist(points, points),
@@ -144,8 +144,8 @@ def test_the_bounds_are_the_limit_of_fixed_point_iteration(gamma: float, slope: 
     assert 1 <= improvements < 50
 
 
-def test_a_step_that_ends_leads_to_the_start_state_of_its_own_rollout() -> None:
-    """With a slope so steep that no sample says anything of another state."""
+def test_a_termination_leads_to_the_start_state_of_its_own_rollout() -> None:
+    """With a slope so steep that no sample bounds V at another state."""
     gamma = 0.9
     long = Rollout([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], np.zeros((2, 2)), [1.0, 2.0], True)
     short = Rollout([[0.0, 9.0], [1.0, 9.0]], np.zeros((1, 2)), [-1.0], True)
@@ -156,17 +156,17 @@ def test_a_step_that_ends_leads_to_the_start_state_of_its_own_rollout() -> None:
     }
     for order in (("long", "short"), ("short", "long")):
         rollouts = [{"long": long, "short": short}[name] for name in order]
-        policy = learnt(rollouts, lipschitz=1e6, restart_probability=0.1)
+        policy = learn_policy(rollouts, lipschitz=1e6, restart_probability=0.1)
         expected = np.concatenate([wanted[name] for name in order])
         np.testing.assert_allclose(policy.bounds, expected, rtol=1e-9)
-    cut_off = learnt([long, replace(short, terminated=False)], lipschitz=1e6)
-    assert cut_off.bounds[2] < -1000.0  # there a state follows of which nothing is known
+    cut_off = learn_policy([long, replace(short, terminated=False)], lipschitz=1e6)
+    assert cut_off.bounds[2] < -1000.0  # its successor is far from every sample
 
 
-def test_the_unit_and_the_origin_of_the_reward_are_those_of_the_bounds() -> None:
+def test_bounds_scale_and_shift_with_the_reward() -> None:
     rollouts = rollouts_of(3)
-    plain = learnt(rollouts, restart_probability=0.1)
-    moved = learnt(
+    plain = learn_policy(rollouts, restart_probability=0.1)
+    moved = learn_policy(
         [replace(r, rewards=7.0 * r.rewards + 3.0) for r in rollouts], restart_probability=0.1
     )
     np.testing.assert_allclose(moved.bounds, 7.0 * plain.bounds + 3.0 / 0.1, rtol=1e-9)
@@ -175,26 +175,44 @@ def test_the_unit_and_the_origin_of_the_reward_are_those_of_the_bounds() -> None
     np.testing.assert_array_equal(moved.greedy(states), plain.greedy(states))
 
 
+@pytest.mark.parametrize(
+    ("residual", "note"), [(0.0, ""), (1e-9, ""), (1.1e-9, "NOT CONVERGED"), (1.0, "NOT CONVERGED")]
+)
+def test_a_residual_above_rounding_is_shown_as_not_converged(residual: float, note: str) -> None:
+    info = NPALPInfo(samples=20, improvements=1000, residual=residual, seconds={})
+    assert info.shown()["note"] == note
+    assert info.converged == (note == "")
+    assert info.numbers() == {"improvements": 1000, "residual": residual}
+
+
+def test_too_few_improvements_leave_a_residual() -> None:
+    data = Transitions.from_rollouts(rollouts_of(7, 8, 10))
+    costs = 0.5 * cdist(data.points[data.successor], data.states)
+    _, improvements, residual = sample_bounds(data.rewards, 0.98, costs, max_improvements=2)
+    assert improvements == 2
+    assert residual > 1e-3
+
+
 # ---- the value function -----------------------------------------------------------------------
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(-3.0, 3.0))
-def test_the_value_function_keeps_to_its_slope_along_random_segments(
+def test_the_value_function_is_lipschitz_along_random_segments(
     seed: int, log_length: float
 ) -> None:
-    policy, rng = made(), np.random.default_rng(seed)
+    policy, rng = random_policy(), np.random.default_rng(seed)
     start, direction = rng.normal(size=(2, 2))
     path = start + np.linspace(0.0, 10.0**log_length, 200)[:, None] * direction
-    values, places = policy.value(path), policy.kernel.embed(path)
-    steps = np.linalg.norm(np.diff(places, axis=0), axis=1)
+    values, embedded = policy.value(path), policy.kernel.embed(path)
+    steps = np.linalg.norm(np.diff(embedded, axis=0), axis=1)
     assert (np.abs(np.diff(values)) <= policy.slope * steps + 1e-9).all()
-    across = np.linalg.norm(places[-1] - places[0])
+    across = np.linalg.norm(embedded[-1] - embedded[0])
     assert abs(values[-1] - values[0]) <= policy.slope * across + 1e-9
 
 
-def test_the_slope_is_made_use_of() -> None:
-    policy = made()
+def test_the_lipschitz_constant_is_attained() -> None:
+    policy = random_policy()
     path = np.linspace([0.0, 3.0], [0.0, 6.0], 50)  # away from all samples
     steps = np.linalg.norm(np.diff(policy.kernel.embed(path), axis=0), axis=1)
     assert np.abs(np.diff(policy.value(path))).max() > 0.9 * policy.slope * steps.max()
@@ -203,21 +221,20 @@ def test_the_slope_is_made_use_of() -> None:
     )
 
 
-def test_the_value_dominates_every_bound_and_touches_some() -> None:
-    for policy in (made(), learnt(rollouts_of(1, 6, 10), lipschitz=2.0)):
+def test_the_value_is_the_maximum_of_the_bounds() -> None:
+    for policy in (random_policy(), learn_policy(rollouts_of(1, 6, 10), lipschitz=2.0)):
         above = policy.value(policy.states) - policy.bounds
         assert (above >= -1e-9).all()
-        assert np.abs(above).min() < 1e-9  # the least such function: the highest bound is kept
-        assert above.max() > 0.1  # and not all are, or this would show little
+        assert np.abs(above).min() < 1e-9  # the smallest such function
+        assert above.max() > 0.1  # not every bound is attained
 
 
 def test_many_states_at_once_are_the_same_as_one_by_one() -> None:
-    policy = made()
+    policy = random_policy()
     states = np.random.default_rng(1).normal(size=(5000, 2))
-    some = [0, 1, 2047, 2048, 4999]
     values, actions = policy.value(states), policy.greedy(states)
     assert values.shape == (5000,) and actions.shape == (5000, 2)
-    for i in some:
+    for i in [0, 1, 2047, 2048, 4999]:
         assert policy.value(states[i : i + 1])[0] == pytest.approx(values[i], rel=1e-12)
         np.testing.assert_array_equal(policy.greedy(states[i : i + 1])[0], actions[i])
 
@@ -226,7 +243,7 @@ def test_many_states_at_once_are_the_same_as_one_by_one() -> None:
 
 
 def test_the_greedy_action_is_that_of_the_maximising_sample() -> None:
-    policy = made()
+    policy = random_policy()
     chosen = set()
     for state in np.random.default_rng(2).uniform(-3.0, 3.0, (100, 2)):
         e = policy.kernel.embed(state[None])[0]
@@ -240,17 +257,17 @@ def test_the_greedy_action_is_that_of_the_maximising_sample() -> None:
     assert len(chosen) > 5
 
 
-def test_the_learnt_actions_are_the_applied_ones_of_the_samples() -> None:
+def test_the_actions_of_the_policy_are_the_applied_ones_of_the_samples() -> None:
     rollouts = rollouts_of(4)
-    policy = learnt(rollouts)
+    policy = learn_policy(rollouts)
     commanded = np.concatenate([r.actions for r in rollouts])
     np.testing.assert_array_equal(policy.actions, np.clip(commanded, [-2.0, 0.0], [2.0, 10.0]))
     assert not np.array_equal(policy.actions, commanded)
 
 
 @pytest.mark.parametrize("fraction", [0.1, 0.3, 0.8, 1.0])
-def test_the_noise_has_its_share_and_its_distribution(fraction: float) -> None:
-    policy, count = made(fraction, scale=0.2), 20_000
+def test_a_fraction_of_the_actions_has_gaussian_noise(fraction: float) -> None:
+    policy, count = random_policy(fraction, scale=0.2), 20_000
     states = np.tile([0.3, -0.2], (count, 1))
     noise = np.random.default_rng(11).standard_normal((count, 2))
     added = policy.act(states, noise) - policy.greedy(states)
@@ -263,7 +280,7 @@ def test_the_noise_has_its_share_and_its_distribution(fraction: float) -> None:
 
 
 def test_without_noise_all_actions_are_greedy() -> None:
-    policy = made(0.0)
+    policy = random_policy(0.0)
     states, noise = np.random.default_rng(12).normal(size=(2, 500, 2))
     with np.errstate(all="raise"):
         actions = policy.act(states, noise)
@@ -271,8 +288,8 @@ def test_without_noise_all_actions_are_greedy() -> None:
     assert np.isfinite(actions).all()
 
 
-def test_with_noise_on_every_action_none_is_lost() -> None:
-    policy = made(1.0)
+def test_noise_on_every_action_includes_the_far_tails() -> None:
+    policy = random_policy(1.0)
     states, noise = np.random.default_rng(13).normal(size=(2, 500, 2))
     noise[:4, 0] = [8.0, -8.0, 0.0, -30.0]  # far tails
     with np.errstate(all="raise"):
@@ -282,6 +299,6 @@ def test_with_noise_on_every_action_none_is_lost() -> None:
     assert added[3, 0] == pytest.approx(0.2 * 2.0 * -30.0)
 
 
-def test_a_policy_with_noise_settings_of_the_learner_has_them() -> None:
-    policy = learnt(rollouts_of(0), noise_fraction=0.0, noise_scale=0.7)
+def test_the_policy_has_the_noise_of_the_settings() -> None:
+    policy = learn_policy(rollouts_of(0), noise_fraction=0.0, noise_scale=0.7)
     assert (policy.noise_fraction, policy.noise_scale) == (0.0, 0.7)

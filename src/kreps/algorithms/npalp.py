@@ -1,10 +1,10 @@
 """Non-parametric approximate linear programming (Pazis and Parr 2011), for deterministic tasks.
 
-The linear program: minimise ``sum_i V(s_i)`` over functions V of a given Lipschitz constant with
-``V(s_i) >= r_i + gamma V(s'_i)`` for each sample.  Feasible functions have a least one, so it
-is the solution, and it has the form ``V(s) = max_i (q_i - L |s - s_i|)`` with
-``q_i = r_i + gamma V(s'_i)``.  That fixed point is found exactly by policy iteration over which
-sample gives which successor its value; a test compares it with the linear program itself.
+The linear program: minimise ``sum_i V(s_i)`` over functions V with Lipschitz constant L and
+``V(s_i) >= r_i + gamma V(s'_i)`` for each sample.  The pointwise minimum of all feasible functions
+is feasible, so it is the solution.  It has the form ``V(s) = max_i (q_i - L |s - s_i|)`` with
+``q_i = r_i + gamma V(s'_i)``.  This fixed point is computed exactly by policy iteration over which
+sample attains the maximum at each successor; a test compares it with the linear program.
 """
 
 from __future__ import annotations
@@ -26,18 +26,20 @@ from kreps.policies.value_based import LipschitzPolicy
 from kreps.settings import NPALPSettings
 
 MAX_IMPROVEMENTS = 1000
+"""Largest number of policy improvements.  In tests there are fewer than fifty."""
 
-RESIDUAL = 1e-9
-"""Of the fixed point, in standard deviations of the reward: what rounding leaves."""
+RESIDUAL_TOLERANCE = 1e-9
+"""Largest residual of the fixed point that counts as rounding, in standard deviations of the
+reward."""
 
 
 @dataclass(frozen=True)
 class NPALPInfo:
-    """What is only reported of an update.
+    """Diagnostics of an update.
 
     Attributes:
         samples: n.
-        improvements: of policy iteration.
+        improvements: number of policy improvements.
         residual: largest violation of the fixed point, in standard deviations of the reward.
         seconds: CPU seconds by stage.
     """
@@ -47,16 +49,21 @@ class NPALPInfo:
     residual: float
     seconds: dict[str, float]
 
+    @property
+    def converged(self) -> bool:
+        """Whether the fixed point is exact up to rounding."""
+        return self.residual <= RESIDUAL_TOLERANCE
+
     def numbers(self) -> dict[str, float]:
         """The diagnostics of the method, by name."""
         return {"improvements": self.improvements, "residual": self.residual}
 
     def shown(self) -> dict[str, str]:
-        """What a progress display shows, by column."""
+        """The columns of a progress display."""
         return {
             "improvements": f"{self.improvements}",
             "residual": f"{self.residual:.0e}",
-            "note": "" if self.residual <= RESIDUAL else "NOT CONVERGED",
+            "note": "" if self.converged else "NOT CONVERGED",
         }
 
 
@@ -67,12 +74,20 @@ def update(
     settings: NPALPSettings,
     rng: np.random.Generator,
 ) -> tuple[LearnerState, NPALPInfo]:
-    """A policy from the window's transitions; nothing is modified.
+    """A policy from all transitions of the replay window, new rollouts included.
+
+    Args:
+        state: of the learner before the update; it is not modified.
+        rollouts: the new ones.
+        task: limits and scale of the actions, and which coordinates are angles.
+        settings: of the method.
+        rng: draws the points of which median distances are computed.
 
     Raises:
-        DataError: no roll-outs at all, or some of another width than the task's.
+        DataError: no rollout at all, or one of another width than the task's.
+        ConfigurationError: more samples than an exact update can take.
     """
-    from scipy.spatial.distance import cdist  # 0.1 s that other methods need not wait
+    from scipy.spatial.distance import cdist  # takes 0.1 s to import, which only NPALP needs
 
     window = state.append(rollouts)
     data = exact_transitions(window)
@@ -82,9 +97,9 @@ def update(
     distances = cdist(points, points[data.state])
     clock.lap("distances")
     rewards, unit = standardise(data.rewards)
-    # a step that really ends the task leads to a start state, here to that of its own roll-out
-    starts = data.start[data.rollout]
-    successor = np.where(data.terminated, starts, data.successor)
+    # after a termination the process restarts; here in the start state of the same rollout
+    own_start = data.start[data.rollout]
+    successor = np.where(data.terminated, own_start, data.successor)
     bounds, improvements, residual = sample_bounds(
         rewards,
         1.0 - settings.restart_probability,
@@ -106,29 +121,31 @@ def update(
 
 
 def sample_bounds(
-    rewards: FloatArray, gamma: float, costs: FloatArray
+    rewards: FloatArray, gamma: float, costs: FloatArray, max_improvements: int = MAX_IMPROVEMENTS
 ) -> tuple[FloatArray, int, float]:
-    """The least ``q`` with ``q_i = r_i + gamma max_j (q_j - costs_ij)``, by policy iteration.
+    """The smallest q with ``q_i = r_i + gamma max_j (q_j - costs_ij)``, by policy iteration.
 
     Args:
         rewards: (n,).
         gamma: discount.
         costs: (n, n) Lipschitz constant times the distance from successor i to sample j.
+        max_improvements: largest number of policy improvements.
 
     Returns:
-        q (n,), the improvements made, and the largest residual of the equation.
+        q (n,), the number of improvements, and the largest residual of the equation.
     """
     n = len(rewards)
     rows = np.arange(n)
-    giver = costs.argmin(axis=1)  # which sample gives each successor its value
+    maximiser = costs.argmin(axis=1)  # the sample j that attains the maximum for each i
     improvements = 0
     while True:
         improvements += 1
-        chain = coo_array((np.full(n, gamma), (rows, giver)), shape=(n, n))
-        q = spsolve((eye_array(n) - chain).tocsc(), rewards - gamma * costs[rows, giver])
-        worth = q - costs
-        better = worth.argmax(axis=1)
-        residual = float(np.max(gamma * (worth[rows, better] - worth[rows, giver])))
-        if residual <= RESIDUAL or improvements == MAX_IMPROVEMENTS:
+        chain = coo_array((np.full(n, gamma), (rows, maximiser)), shape=(n, n))
+        q = spsolve((eye_array(n) - chain).tocsc(), rewards - gamma * costs[rows, maximiser])
+        values = q - costs
+        improved = values.argmax(axis=1)
+        gains = values[rows, improved] - values[rows, maximiser]
+        residual = float(np.max(gamma * gains))
+        if residual <= RESIDUAL_TOLERANCE or improvements == max_improvements:
             return q, improvements, residual
-        giver = better
+        maximiser = improved

@@ -1,8 +1,8 @@
-"""Value iteration with RKHS embeddings (Gruenewaelder et al. 2012), the greedy rival of Sec. 4.2.
+"""Value iteration with RKHS embeddings (Gruenewaelder et al. 2012), a baseline of Sec. 4.2.
 
-``Q(s, a) = sum_i beta_i(s, a) (r_i + gamma V(s'_i))`` with the embedding strengths beta of Eq. 4
-and V the maximum of Q over candidate actions, or a soft maximum on-policy, iterated to a
-fixed point.  The process restarts with probability p, hence ``gamma = 1 - p``.
+``Q(s, a) = sum_i beta_i(s, a) (r_i + gamma V(s'_i))`` with the embedding strengths beta of Eq. 4.
+V is the maximum of Q over candidate actions or, on-policy, a soft maximum.  Both are iterated to a
+fixed point.  The process restarts with probability p, so the discount is ``gamma = 1 - p``.
 """
 
 from __future__ import annotations
@@ -25,24 +25,25 @@ from kreps.policies.value_based import SoftmaxPolicy, soft_maximum
 from kreps.settings import RKHS, GridValueIterationSettings, ValueIterationSettings
 
 MAX_SWEEPS = 300
-"""0.98^300 is 0.2 %: what is then left moves no action."""
+"""Largest number of sweeps.  With a discount of 0.98 they reduce the distance from the fixed point
+to 0.2 %."""
 
-TOLERANCE = 1e-3
-"""Of V between sweeps, up to a constant, in standard deviations of the reward."""
+CHANGE_TOLERANCE = 1e-3
+"""Largest change of V in the last sweep, up to a constant, in standard deviations of the reward."""
 
 BASIS = RKHS()
-"""Its basis is that of the features that the embedding is fitted to predict: as in REPS."""
+"""The features that the embedding predicts for its fit: those of V in KREPS by default."""
 
 
 @dataclass(frozen=True)
 class ValueIterationInfo:
-    """What is only reported of an update.
+    """Diagnostics of an update.
 
     Attributes:
         samples: n.
-        sweeps: of value iteration.
-        change: of V in the last sweep, up to a constant, in standard deviations of the reward.
-        embedding_parameters: fitted lengthscales and lambda.
+        sweeps: number of sweeps.
+        change: range of the change of V in the last sweep, in standard deviations of the reward.
+        embedding_parameters: (g + da + 1,) fitted lengthscales and lambda.
         seconds: CPU seconds by stage.
     """
 
@@ -54,14 +55,15 @@ class ValueIterationInfo:
 
     @property
     def converged(self) -> bool:
-        return self.change <= TOLERANCE
+        """Whether V is a fixed point to `CHANGE_TOLERANCE`."""
+        return self.change <= CHANGE_TOLERANCE
 
     def numbers(self) -> dict[str, float]:
         """The diagnostics of the method, by name."""
         return {"sweeps": self.sweeps, "change": self.change}
 
     def shown(self) -> dict[str, str]:
-        """What a progress display shows, by column."""
+        """The columns of a progress display."""
         return {
             "sweeps": f"{self.sweeps}",
             "change": f"{self.change:.0e}",
@@ -76,10 +78,19 @@ def update(
     settings: ValueIterationSettings | GridValueIterationSettings,
     rng: np.random.Generator,
 ) -> tuple[LearnerState, ValueIterationInfo]:
-    """A policy from the window's transitions; nothing is modified.
+    """A policy from all transitions of the replay window, new rollouts included.
+
+    Args:
+        state: of the learner before the update; it is not modified.
+        rollouts: the new ones.
+        task: limits and scale of the actions, and which coordinates are angles.
+        settings: of the method.
+        rng: draws the samples of the fits.
 
     Raises:
-        DataError: no roll-outs at all, or some of another width than the task's.
+        DataError: no rollout at all, or one of another width than the task's.
+        ConfigurationError: more samples than an exact update can take, or too few candidate
+            actions.
     """
     window = state.append(rollouts)
     data = exact_transitions(window)
@@ -95,23 +106,22 @@ def update(
     clock.lap("embedding")
     rewards, unit = standardise(data.rewards)
     candidates = candidate_actions(task, settings.actions)
-    table, offset, sweeps, change = iterate_values(
-        model, data, rewards, candidates, settings.temperature, 1.0 - settings.restart_probability
-    )
+    gamma = 1.0 - settings.restart_probability
+    q = iterate_values(model, data, rewards, candidates, settings.temperature, gamma)
     clock.lap("sweeps")
     policy = SoftmaxPolicy(
         task,
         model.kernel.part(slice(-task.action_size)),
         data.states,
-        unit * table,
-        unit * offset + float(data.rewards.max()) / settings.restart_probability,
+        unit * q.table,
+        unit * q.offset + float(data.rewards.max()) / settings.restart_probability,
         candidates,
         unit * settings.temperature,
     )
     new_state = state.after(
         len(rollouts), sum(map(len, rollouts)), window, policy=policy, embedding_start=start
     )
-    info = ValueIterationInfo(len(data), sweeps, change, np.exp(start), clock.seconds)
+    info = ValueIterationInfo(len(data), q.sweeps, q.change, np.exp(start), clock.seconds)
     return new_state, info
 
 
@@ -119,7 +129,7 @@ def candidate_actions(task: TaskSpec, count: int) -> FloatArray:
     """At most ``count`` evenly spaced scaled actions (k, da), limits included.
 
     Raises:
-        ConfigurationError: not even the limits of every action coordinate fit.
+        ConfigurationError: ``count`` is smaller than the number of corners of the action space.
     """
     levels = int(count ** (1.0 / task.action_size) + 1e-9)
     if levels < 2:
@@ -131,6 +141,23 @@ def candidate_actions(task: TaskSpec, count: int) -> FloatArray:
     return grid_points([np.linspace(-1.0, 1.0, levels)] * task.action_size)
 
 
+@dataclass(frozen=True)
+class QFunction:
+    """``Q(s, a_k) = offset + sum_i k_s(s_i, s) table_ik``.
+
+    Attributes:
+        table: (n, k) of samples and candidate actions.
+        offset: value far from the data.
+        sweeps: number of sweeps.
+        change: range of the change of V in the last sweep.
+    """
+
+    table: FloatArray
+    offset: float
+    sweeps: int
+    change: float
+
+
 def iterate_values(
     model: KernelEmbedding,
     data: Transitions,
@@ -138,30 +165,28 @@ def iterate_values(
     candidates: FloatArray,
     temperature: float,
     gamma: float,
-) -> tuple[FloatArray, float, int, float]:
+) -> QFunction:
     """The fixed point of ``Q(s, a) = sum_i beta_i(s, a) (r_i + gamma V(s'_i))``.
 
-    The strengths beta need not add up to one, so that far from the data a sum over them fades to
-    zero: they are applied to the targets less their mean, to which Q then fades.
+    Far from the data the strengths beta vanish, and a sum over them would predict zero.  So they
+    are applied to the targets less their mean, which Q approaches there.
 
     Args:
-        model: on states and scaled actions, as it was fitted to ``data``.
+        model: embedding on states and scaled actions, fitted to ``data``.
         data: n transitions.
         rewards: (n,), standardised.
         candidates: (k, da) scaled actions.
         temperature: of the soft maximum; zero for the maximum.
         gamma: discount.
-
-    Returns:
-        Table (n, k) and offset with ``Q(s, a_k) = offset + sum_i k_s(s_i, s) table_ik``, sweeps
-        made, and the change of V (up to a constant) in the last one.
     """
     ds, da = data.points.shape[1], candidates.shape[1]
-    # the kernel's last factors are those of the actions, one for each coordinate
+    # the kernel's last factors are those of the actions, one per coordinate
     states = model.kernel.part(slice(-da)).gram(data.states, data.points).T  # (points, n)
-    in_their_columns = np.pad(candidates, ((0, 0), (ds, 0)))
-    actions = model.kernel.part(slice(-da, None)).gram(model.inputs, in_their_columns)  # (n, k)
-    least, most = rewards.min() / (1.0 - gamma), rewards.max() / (1.0 - gamma)
+    padded = np.pad(candidates, ((0, 0), (ds, 0)))  # the factors select columns after the states
+    actions = model.kernel.part(slice(-da, None)).gram(model.inputs, padded)  # (n, k)
+    # Strengths may sum to more than one.  Returns beyond those of the extreme rewards are clipped,
+    # or V could diverge.
+    min_return, max_return = rewards.min() / (1.0 - gamma), rewards.max() / (1.0 - gamma)
     values = np.zeros(len(data.points))
     sweeps = 0
     while True:
@@ -169,12 +194,12 @@ def iterate_values(
         targets = rewards + gamma * successor_features(data, values)
         offset = float(targets.mean())
         table = model.factor.solve(targets - offset)[:, None] * actions
-        # what rewards in this range can add up to bounds an expectation that is none
-        fresh = np.clip(soft_maximum(offset + states @ table, temperature), least, most)
-        difference = fresh - values
+        maxima = soft_maximum(offset + states @ table, temperature)
+        new_values = np.clip(maxima, min_return, max_return)
+        difference = new_values - values
         change = float(difference.max() - difference.min())
-        values = fresh
-        if change <= TOLERANCE or sweeps == MAX_SWEEPS:
-            # differences of V have settled; its level goes on by a geometric series
+        values = new_values
+        if change <= CHANGE_TOLERANCE or sweeps == MAX_SWEEPS:
+            # the shape of V has converged; further sweeps would add a geometric series to its level
             offset += float(difference.mean()) * gamma / (1.0 - gamma)
-            return table, offset, sweeps, change
+            return QFunction(table, offset, sweeps, change)
