@@ -62,6 +62,12 @@ class TaskSpec:
                 f"observation_size = {self.observation_size!r} and periodic = {self.periodic!r}, "
                 "but a whole number and a list of whole numbers are needed, as 3 and (0, 2)"
             ) from error
+        self._check_sizes()
+        self._check_groups()
+        if self.image_shape is not None:
+            self._check_images(self.image_shape)
+
+    def _check_sizes(self) -> None:
         if self.observation_size < 1:
             raise ConfigurationError(
                 f"observation_size = {self.observation_size}, but at least one coordinate is needed"
@@ -77,7 +83,15 @@ class TaskSpec:
                 f"action limits {low} to {high} must be finite and low < high, as their range is "
                 "the scale of the actions; give a bounded range"
             )
+
+    def _check_groups(self) -> None:
         grouped = [i for group in self.groups for i in group]
+        outside = [i for i in (*self.periodic, *grouped) if not 0 <= i < self.observation_size]
+        if outside:
+            raise ConfigurationError(
+                f"periodic or grouped coordinates {outside!s:.60} do not exist; observations have "
+                f"{self.observation_size} coordinates, numbered from 0"
+            )
         if len(set(grouped)) < len(grouped):
             raise ConfigurationError(
                 "a coordinate is in two groups, but can have only one lengthscale; leave it out of "
@@ -90,31 +104,24 @@ class TaskSpec:
                 f"the group {mixed[0]!s:.60} mixes angles and other coordinates, which cannot "
                 "share a lengthscale; make a group of each"
             )
-        if self.image_shape is not None:
-            try:
-                height, width = (operator.index(size) for size in self.image_shape)
-            except (TypeError, ValueError):
-                height, width = 0, 0
-            if not (1 <= height <= MAX_IMAGE_SIDE and 1 <= width <= MAX_IMAGE_SIDE):
-                raise ConfigurationError(
-                    f"image_shape = {self.image_shape!r:.60}, but (height, width) is needed, two "
-                    f"whole numbers from 1 to {MAX_IMAGE_SIDE}"
-                )
-            object.__setattr__(self, "image_shape", (height, width))
-            if {len(group) for group in self.groups} != {height * width} or (
-                len(grouped) != self.observation_size
-            ):
-                raise ConfigurationError(
-                    f"image_shape = {self.image_shape}, but the groups have "
-                    f"{[len(group) for group in self.groups]!s:.60} of {self.observation_size} "
-                    f"coordinates; each must be an image of {height} x {width}, and all in one"
-                )
-        named = (*self.periodic, *grouped)
-        outside = [i for i in named if not 0 <= i < self.observation_size]
-        if outside:
+
+    def _check_images(self, shape: tuple[int, int]) -> None:
+        try:
+            height, width = (operator.index(size) for size in shape)
+        except (TypeError, ValueError):
+            height, width = 0, 0
+        if not (1 <= height <= MAX_IMAGE_SIDE and 1 <= width <= MAX_IMAGE_SIDE):
             raise ConfigurationError(
-                f"periodic or grouped coordinates {outside!s:.60} do not exist; observations have "
-                f"{self.observation_size} coordinates, numbered from 0"
+                f"image_shape = {shape!r:.60}, but (height, width) is needed, two whole numbers "
+                f"from 1 to {MAX_IMAGE_SIDE}"
+            )
+        object.__setattr__(self, "image_shape", (height, width))
+        sizes = [len(group) for group in self.groups]
+        if set(sizes) != {height * width} or sum(sizes) != self.observation_size:
+            raise ConfigurationError(
+                f"image_shape = {self.image_shape}, but the groups have {sizes!s:.60} of "
+                f"{self.observation_size} coordinates; each group must be an image of {height} x "
+                f"{width}, and each coordinate must be in a group"
             )
 
     @property
