@@ -20,6 +20,7 @@ import pytest
 import safetensors.numpy
 
 import kreps
+from kreps.app.run_folder import RunFolder
 from kreps.errors import ConfigurationError, StorageError
 from kreps.learning.learner import Learner
 from kreps.learning.methods import LEARNERS
@@ -195,6 +196,22 @@ def test_the_config_of_an_old_run_is_the_settings_of_its_checkpoint() -> None:
     columns = (FOLDER / "run" / "progress.csv").read_text().splitlines()[0].split(",")
     assert {"rejected", "cpu_seconds_acceptance_test"} <= set(present_columns(columns))
     assert present_columns(present_columns(columns)) == present_columns(columns)
+
+
+def test_an_old_run_folder_is_read() -> None:
+    folder = RunFolder(FOLDER / "run")
+    config = folder.config()
+    assert (config.environment, config.seed, config.preset) == (
+        "kreps/SwingUp-v0",
+        3,
+        "single_step",
+    )
+    # without effect in version 0.1, as it made no model-based step and had no grid
+    assert not {"model_based.acceptance_rollouts", "value.size"} & config.settings.keys()
+    learner = kreps.KREPS.resume(folder.checkpoint_file)
+    assert settings_of(config.preset, **config.settings) == learner.settings
+    assert [int(row["iteration"]) for row in folder.rows()] == [1, 2]
+    assert [row["rejected"] for row in folder.rows()] == ["nan", "nan"]
 
 
 # ---- files that are refused -------------------------------------------------------------------

@@ -88,7 +88,7 @@ class RunFolder:
             content.pop("versions", None)
             if "recipe" in content and "preset" not in content:  # version 0.1
                 content["preset"] = present_preset(content.pop("recipe"))
-                content["settings"] = present_settings(content["settings"])
+                content["settings"] = present_settings(content["settings"], content["preset"])
             config = RunConfig(**content)
             types = {"environment": str, "iterations": int, "seed": int, "settings": dict}
             for name, kind in types.items():
