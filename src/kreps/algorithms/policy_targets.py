@@ -1,4 +1,4 @@
-"""What the policy is fitted to, and its hyper-parameters (Sec. 2, generalising the weights)."""
+"""Weighted targets of the policy fit, and its hyper-parameters (Sec. 2)."""
 
 from __future__ import annotations
 
@@ -18,11 +18,16 @@ from kreps.kernels.sampling import uniform_subsample
 from kreps.policies.base import LearntPolicy
 
 MIN_RELATIVE_WEIGHT = 0.05
-"""Samples with ``n p_i`` below this do not enter the policy: their effect on it is negligible."""
+"""Samples with ``n p_i`` below this are left out of the policy fit.  In total they have less than
+this share of the weight, and the cost of the policy grows with the number of samples."""
 
 MIN_ACTION_VARIANCE = 1e-4
-"""Smallest variance of the weighted actions within a state, in units of the action scale squared:
-exploration noise never vanishes altogether."""
+"""Smallest variance of exploration noise, in units of the action scale squared, so that learning
+does not stop."""
+
+MIN_TARGET_VARIANCE = 1e-4
+"""Smallest variance of the targets, in units of the action scale squared, at which priors are
+centred: that of equal targets is zero and has no logarithm."""
 
 
 @dataclass(frozen=True)
@@ -121,10 +126,10 @@ class PolicyFit:
     """A fitted policy.
 
     Attributes:
-        policy: it.
-        x: (g + 2,) the log hyper-parameters of its fit (`policy_hyperparameters`).
-        support: number of its support points.
-        noise: variance with which it explores, in units of the action scale squared.
+        policy: with its exploration noise.
+        x: (g + 2,) log hyper-parameters of the fit (`policy_hyperparameters`).
+        support: number of support points.
+        noise: variance of the exploration noise, in units of the action scale squared.
     """
 
     policy: LearntPolicy
@@ -134,7 +139,7 @@ class PolicyFit:
 
 
 def policy_hyperparameters(
-    samples: PolicyTargets,
+    targets: PolicyTargets,
     state_kernel: Kernel,
     policy_fit: str,
     start: FloatArray | None,
@@ -143,48 +148,56 @@ def policy_hyperparameters(
     """Log lengthscales (g,), log sf2 and log l of the policy, by weighted leave-one-out density.
 
     Args:
-        samples: those that the policy is fitted to, or some of them.
-        state_kernel: its factors are those of the policy's kernel, with other lengthscales.
-        policy_fit: ``"map"``, with priors around median distances; or ``"bounded"``, within hard
-            ranges.
-        start: log hyper-parameters (g + 2,) to start the fit from; None for the prior's centre.
-        rng: chooses the samples of the fit.
+        targets: those that the policy is fitted to, or a subsample of them.
+        state_kernel: its factors are those of the policy's kernel; its lengthscales are the median
+            distances.
+        policy_fit: ``"map"``, with Gaussian priors around the median distances; or ``"bounded"``,
+            within hard ranges.
+        start: log hyper-parameters (g + 2,) from which the fit starts; None for the prior's centre.
+        rng: draws the samples of the fit.
     """
-    median = np.log(state_kernel.lengthscales)
-    g = len(median)
-    share = samples.weights / samples.weights.sum()
-    centred = samples.targets - share @ samples.targets
+    prior = policy_prior(targets, state_kernel, policy_fit)
+    rows = uniform_subsample(len(targets.weights), rng)
+    loss = PolicyLoss(
+        factor_distances(state_kernel.factors, targets.states[rows]),
+        targets.targets[rows],
+        targets.weights[rows],
+        targets.target_variance[rows],
+    )
+    return minimise(loss, prior, prior.centre if start is None else start)
+
+
+def policy_prior(targets: PolicyTargets, state_kernel: Kernel, policy_fit: str) -> Prior:
+    """Prior and ranges of the log hyper-parameters (g + 2,); arguments as before.
+
+    A priori, lengthscales are somewhat shorter than median distances, and more of the variance of
+    the weighted actions is due to the state than to noise.
+    """
+    median, g = np.log(state_kernel.lengthscales), len(state_kernel.lengthscales)
+    share = targets.weights / targets.weights.sum()
+    centred = targets.targets - share @ targets.targets
     variance = float(np.mean(share @ centred**2))
-    variance += float(share @ samples.target_variance) / centred.shape[1]
-    log_variance = np.log(max(variance, 1e-4))
+    variance += float(share @ targets.target_variance) / centred.shape[1]
+    log_variance = np.log(max(variance, MIN_TARGET_VARIANCE))
     centre = np.concatenate([median - 0.5, [log_variance - 0.3, log_variance - 1.0]])
     if policy_fit == "map":
-        prior = Prior(
+        return Prior(
             centre=centre,
             std=np.concatenate([np.full(g, 0.7), [1.0, 1.0]]),
             low=np.concatenate([median - 4.0, np.log([1e-4, 1e-4])]),
             high=np.concatenate([median + 3.0, np.log([1e2, 1e2])]),
-            strength=1.0 / samples.total_weight,
+            strength=1.0 / targets.total_weight,  # the loss is per unit of weight
         )
-    else:
-        prior = Prior(
-            centre=centre,
-            std=np.ones(g + 2),
-            low=np.concatenate([median + np.log(0.3), np.log([0.01, 1e-4])]),
-            high=np.concatenate([median, np.log([3.0, 4.0])]),
-            strength=0.0,
-        )
-    rows = uniform_subsample(len(share), rng)
-    loss = PolicyLoss(
-        factor_distances(state_kernel.factors, samples.states[rows]),
-        samples.targets[rows],
-        samples.weights[rows],
-        samples.target_variance[rows],
+    return Prior(
+        centre=centre,
+        std=np.ones(g + 2),
+        low=np.concatenate([median + np.log(0.3), np.log([0.01, 1e-4])]),
+        high=np.concatenate([median, np.log([3.0, 4.0])]),
+        strength=0.0,
     )
-    return minimise(loss, prior, centre if start is None else start)
 
 
-def exploration_noise(samples: PolicyTargets, fitted: float) -> tuple[FloatArray, float]:
+def exploration_noise(targets: PolicyTargets, fitted: float) -> tuple[FloatArray, float]:
     """Weights (m,) and noise l of the policy, from the fitted noise.
 
     The fitted noise also contains the residuals of the mean, which are large where the targets
@@ -192,5 +205,5 @@ def exploration_noise(samples: PolicyTargets, fitted: float) -> tuple[FloatArray
     Weights are divided by the same factor as the noise, so that ``l / w_i``, and with it the mean,
     stays as fitted.
     """
-    noise = min(fitted, max(samples.action_variance, MIN_ACTION_VARIANCE))
-    return samples.weights * (noise / fitted), noise
+    noise = min(fitted, max(targets.action_variance, MIN_ACTION_VARIANCE))
+    return targets.weights * (noise / fitted), noise

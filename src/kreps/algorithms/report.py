@@ -1,4 +1,4 @@
-"""What an update reports of itself."""
+"""The report of an update of KREPS."""
 
 from __future__ import annotations
 
@@ -10,31 +10,34 @@ from kreps.kernels.arrays import FloatArray
 
 @dataclass(frozen=True)
 class UpdateInfo:
-    """What is only reported of an update.
+    """Diagnostics of an update, which the learner does not carry on.
 
     Attributes:
         samples: n.
-        kl_bound: epsilon.
-        eta_floor: least temperature as taken, in standard deviations of the reward.
+        kl_bound: epsilon, in nats.
+        eta_floor: smallest temperature, in standard deviations of the reward.
         ridge: rho times the number of samples.
-        model_error: of the transition model by leave-one-out, relative (`LeaveOneOut.relative`);
-            nan without a model.
-        clipped: share of the commanded actions that lie beyond the limits: those of the new
-            roll-outs, of all kept ones if there are none, or of a data set's sample.
-        rank: features of V; ``rank_residual`` is the largest squared residual they leave.
-        dual: the last step's solution with its certificate.
-        effective_samples: effective sample size of the weights.
-        support: support points of the policy.
-        state_lengthscales: of V's kernel, but for cuts of angles.
-        embedding_parameters, policy_parameters: fitted values (not logs): lengthscales, then
-            lambda, or sf2 and l.  The former are those of the transition model, whichever it is.
-            After widened imagined steps the policy has its sf2 and noise divided.
-        noise: variance that actions are drawn with, in units of the action scale squared, by the
-            fitted policy.
-        refused: whether the model found the fitted policy worse than the one before, which then
-            acts on; None where nothing was judged.
-        jitter: largest jitter that a factorisation of this update needed; trial points of the
-            hyper-parameter searches do not count.
+        model_error: leave-one-out error of the transition model in feature space, relative to the
+            change of the features (`LeaveOneOut.relative`); nan without a model.
+        clipped: share of the commanded actions beyond the limits, among those of the new rollouts;
+            of the window if there are no new ones, or of the subsample of a data set.
+        rank: number of features of V.
+        rank_residual: largest squared residual of a sampled state in these features.
+        dual: solution of the last step, with its certificate.
+        effective_samples: effective sample size of its weights.
+        support: number of support points of the policy.
+        state_lengthscales: (g,) of the kernel over states, without those of wrapped angles.
+        embedding_parameters: (g + da + 1,) fitted lengthscales and lambda of the transition model,
+            whichever it is; None without a model.
+        policy_parameters: (g + 2,) fitted lengthscales, sf2 and l of the policy.  If actions are
+            generated with an inflated standard deviation, the policy has sf2 and noise divided by
+            the square of the factor.
+        noise: variance of the exploration noise of the fitted policy, in units of the action scale
+            squared.
+        rejected: whether the fitted policy failed the acceptance test, so that the previous one
+            acts; None without a test.
+        jitter: largest jitter of a factorisation of this update, except those at trial points of
+            the hyper-parameter fits.
         seconds: CPU seconds of this process by stage.
     """
 
@@ -67,13 +70,13 @@ class UpdateInfo:
         }
 
     def shown(self) -> dict[str, str]:
-        """What a progress display shows, by column."""
+        """The columns of a progress display."""
         return {
             "KL / bound": f"{self.dual.kl:.3f} / {self.kl_bound:g}",
             "eta": f"{self.dual.eta:.3g}",
             "ESS": f"{self.effective_samples:.0f}",
             "gap": f"{self.dual.gap:.0e}",
             "note": f"{self.dual.outcome.note}"
-            + ("  refused: the policy before acts" if self.rejected else "")
+            + ("  rejected: the previous policy acts" if self.rejected else "")
             + (f"  jitter {self.jitter:.0e}" if self.jitter else ""),
         }

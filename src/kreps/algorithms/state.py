@@ -1,4 +1,4 @@
-"""What a learner carries from one update to the next, whatever its method."""
+"""The state of a learner between updates, and the report of an update, for all methods."""
 
 from __future__ import annotations
 
@@ -18,14 +18,16 @@ from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 
 @dataclass(frozen=True)
 class LearnerState:
-    """Everything that is carried from one update to the next: a checkpoint is exactly this.
+    """Everything that is carried from one update to the next; a checkpoint stores it.
 
     Attributes:
         window: the replay window.
         iteration: updates made.
         rollouts, steps: rollouts and environment steps seen, forgotten ones included.
-        policy: the acting policy: of the latest update, or the previous one if that was rejected.
-        value: V of the latest update, rejected or not, if the method has one in an RKHS.
+        policy: the one that acts: that of the latest update, or the previous one if that was
+            rejected; None before the first update.
+        value: V of the latest update, also if its policy was rejected; None for methods whose V is
+            not linear in features.
         embedding_start, reward_start, policy_start: log hyper-parameters from which the next fits
             of the transition model, the reward model and the policy start.
     """
@@ -67,7 +69,7 @@ def exact_transitions(window: ReplayWindow) -> Transitions:
     """The transitions of the window, for an update whose cost is cubic in their number.
 
     Raises:
-        ConfigurationError: more than such an update can serve.
+        ConfigurationError: more than `MAX_SUPPORT` transitions.
     """
     data = window.transitions
     if len(data) > MAX_SUPPORT:
@@ -80,7 +82,7 @@ def exact_transitions(window: ReplayWindow) -> Transitions:
 
 
 class UpdateReport(Protocol):
-    """What every method reports of an update."""
+    """The diagnostics of an update that every method has."""
 
     @property
     def samples(self) -> int:
@@ -97,7 +99,7 @@ class UpdateReport(Protocol):
         ...
 
     def shown(self) -> dict[str, str]:
-        """What a progress display shows, by column."""
+        """The columns of a progress display."""
         ...
 
 
