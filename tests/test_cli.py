@@ -630,6 +630,7 @@ def test_a_compressed_policy_is_not_compressed_again(run: Path, tmp_path: Path) 
 
 # ---- runs of version 0.1 ----------------------------------------------------------------------
 
+OLD_RUN = Path(__file__).parent / "data/v0.1/run"
 OLD_COLUMNS = {
     "rejected": "refused",
     "cpu_seconds_generated_samples": "cpu_seconds_imagined_step",
@@ -637,50 +638,60 @@ OLD_COLUMNS = {
 }
 
 
-def make_old(run: Path) -> None:
-    """Give the files of a run the names of version 0.1."""
-    config = json.loads((run / "config.json").read_text())
-    config["recipe"] = {"model_based": "default"}[config.pop("preset")]
-    config["settings"] |= {"imagined_noise": 1.1, "max_rank": 200, "judging_rollouts": 10}
-    (run / "config.json").write_text(json.dumps(config))
-    progress = (run / "progress.csv").read_text()
-    heading, rows = progress.split("\n", 1)
-    for name, old in OLD_COLUMNS.items():
-        assert name in heading.split(",")
-        heading = heading.replace(name, old)
-    (run / "progress.csv").write_text(f"{heading}\n{rows}")
+@pytest.fixture
+def old_run(tmp_path: Path) -> Path:
+    return Path(shutil.copytree(OLD_RUN, tmp_path / "old"))
 
 
-def test_a_run_of_version_0_1_is_read_and_resumed_with_present_names(run: Path) -> None:
-    before = RunFolder(run).rows()
-    make_old(run)
-    config = RunFolder(run).config()
-    assert config.preset == "model_based"
-    assert config.settings == {
-        "initial_rollouts": 6,
+def test_a_configuration_of_version_0_1_has_present_names(old_run: Path) -> None:
+    config = RunFolder(old_run).config()
+    assert config.preset == "single_step"
+    assert config.settings == {  # settings without effect are left out
+        "restart_probability": 0.12,
+        "initial_rollouts": 5,
         "rollouts_per_iteration": 3,
-        "window": 6,
-        "model_based.proposal_std_scale": 1.1,
-        "value.max_rank": 200,
-        "model_based.acceptance_rollouts": 10,
+        "window": 5,
     }
-    assert RunFolder(run).rows() == before
-    for command in ("plot", "diagnose"):
-        assert call(command, run)[0] == 0
-    assert call("resume", run, "--iterations", "3", "--no-report")[0] == 0
-    heading = (run / "progress.csv").read_text().split("\n", 1)[0].split(",")
-    assert set(OLD_COLUMNS) <= set(heading) and not set(OLD_COLUMNS.values()) & set(heading)
-    assert "recipe" not in json.loads((run / "config.json").read_text())
+    content = json.loads((old_run / "config.json").read_text())
+    content |= {"recipe": "default", "settings": {"judging_rollouts": 10, "max_rank": 200}}
+    (old_run / "config.json").write_text(json.dumps(content))
+    config = RunFolder(old_run).config()
+    assert config.preset == "model_based"
+    assert config.settings == {"model_based.acceptance_rollouts": 10, "value.max_rank": 200}
 
 
-def test_a_run_of_version_0_1_that_stopped_before_its_first_update_is_learnt(run: Path) -> None:
-    make_old(run)
+def test_a_progress_file_of_version_0_1_has_present_names(old_run: Path) -> None:
+    with (old_run / "progress.csv").open(newline="") as file:
+        old = list(csv.DictReader(file))
+    rows = RunFolder(old_run).rows()
+    assert len(rows) == len(old) == 2
+    for row, stored in zip(rows, old, strict=True):
+        assert row == {name: stored[OLD_COLUMNS.get(name, name)] for name in row}
+        assert len(row) == len(stored) and set(OLD_COLUMNS) <= set(row)
+
+
+def test_a_run_of_version_0_1_is_inspected_and_resumed(old_run: Path) -> None:
+    earlier = RunFolder(old_run).rows()
+    for command in ("plot", "diagnose", "video"):
+        assert call(command, old_run)[0] == 0
+    assert call("resume", old_run, "--iterations", "3", "--no-report")[0] == 0
+    with (old_run / "progress.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert rows[:2] == earlier and rows[2]["iteration"] == "3"
+    assert set(OLD_COLUMNS) <= set(rows[0]) and not set(OLD_COLUMNS.values()) & set(rows[0])
+    config = json.loads((old_run / "config.json").read_text())
+    assert config["preset"] == "single_step" and "recipe" not in config
+
+
+def test_a_run_of_version_0_1_that_stopped_before_its_first_update_is_learnt(
+    old_run: Path,
+) -> None:
     for name in RUN_FILES - {"config.json"}:
-        (run / name).unlink()
-    assert call("resume", run, "--no-report")[0] == 0
-    settings = kreps.KREPS.resume(run / "checkpoint.safetensors").settings
-    assert settings.model_based == kreps.ModelBased(proposal_std_scale=1.1, acceptance_rollouts=10)
-    assert settings.value == kreps.RKHS(max_rank=200)
+        (old_run / name).unlink()
+    assert call("resume", old_run, "--no-report")[0] == 0
+    settings = kreps.KREPS.resume(old_run / "checkpoint.safetensors").settings
+    stored = kreps.KREPS.resume(OLD_RUN / "checkpoint.safetensors").settings
+    assert settings == stored
 
 
 # ---- folders that are no runs, and damaged ones -----------------------------------------------

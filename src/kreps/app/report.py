@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from kreps.algorithms.dual import Outcome
@@ -83,28 +84,29 @@ def _say_files(folder: RunFolder, pictures: Sequence[Path]) -> None:
 
 
 def diagnosis_of(folder: RunFolder) -> list[Finding]:
-    """The findings about a run, from its files alone: no environment is made.
+    """The findings about a run, from its files alone, with its folder in their commands.
 
     Raises:
         ConfigurationError: the run has no iteration yet.
     """
     rows = folder.recorded_rows()
     evaluation = folder.evaluation(int(rows[-1]["iteration"]))
-    return diagnose(rows, evaluation, references_of(folder.config()))
+    found = diagnose(rows, evaluation, references_of(folder.config()))
+    return [replace(f, remedy=f.remedy.replace("RUN", str(folder.path))) for f in found]
 
 
-def say_finding(folder: RunFolder, finding: Finding) -> None:
-    """Print a finding, with the run's folder in its commands."""
+def say_finding(finding: Finding) -> None:
+    """Print a finding and its remedy."""
     say(f"{finding.severity.capitalize() + ':':<11}{finding.name}. {finding.sentence}")
     if finding.remedy:
-        say(f"{'':<11}Try: {finding.remedy.replace('RUN', str(folder.path))}")
+        say(f"{'':<11}Try: {finding.remedy}")
 
 
 def say_main_findings(folder: RunFolder) -> None:
     """Print the most severe findings that are not fine."""
     findings = [f for f in diagnosis_of(folder) if f.severity != "fine"]
     for finding in findings[:SHOWN_FINDINGS]:
-        say_finding(folder, finding)
+        say_finding(finding)
     if findings:
         say(f"All findings on one page: kreps diagnose {folder.path}")
     else:
@@ -115,7 +117,7 @@ def say_diagnosis(folder: RunFolder) -> list[Finding]:
     """Print all findings, and which ones are missing in a run of an earlier version."""
     findings = diagnosis_of(folder)
     for finding in findings:
-        say_finding(folder, finding)
+        say_finding(finding)
     if not all_recorded(folder.recorded_rows()):
         say(
             "Not recorded by the version that made the last update: model error, policy noise, "

@@ -87,8 +87,9 @@ class RunFolder:
             content = json.loads(self.config_file.read_text())
             content.pop("versions", None)
             if "recipe" in content and "preset" not in content:  # version 0.1
-                content["preset"] = present_preset(content.pop("recipe"))
-                content["settings"] = present_settings(content["settings"], content["preset"])
+                recipe = content.pop("recipe")
+                content["settings"] = present_settings(content["settings"], recipe)
+                content["preset"] = present_preset(recipe)
             config = RunConfig(**content)
             types = {"environment": str, "iterations": int, "seed": int, "settings": dict}
             for name, kind in types.items():

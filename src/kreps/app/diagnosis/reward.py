@@ -90,7 +90,7 @@ def progress(
             MIN_ITERATIONS,
             f"The trend of the reward is unknown after {counted(len(rows), 'iteration')}; "
             f"{MIN_ITERATIONS} are needed.",
-            "more iterations: kreps resume RUN --iterations 20",
+            "more iterations (kreps resume RUN --iterations 20).",
         )
     minimum = MIN_REWARD_RISE * reward_range(rows)
     limit = max(found.error, minimum)

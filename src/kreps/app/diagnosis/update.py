@@ -85,7 +85,7 @@ def kl_bound(rows: Sequence[Row]) -> Finding:
             share,
             HIGH_KL_SHARE,
             f"{used}, and the reward still rises: the run ended while it was learning.",
-            f"more iterations: kreps resume RUN --iterations {2 * len(rows)}",
+            f"more iterations (kreps resume RUN --iterations {2 * len(rows)}).",
         )
     at_floor = np.mean([row["outcome"] == Outcome.AT_FLOOR.name for row in late]) > 0.5
     if at_floor and share < LOW_KL_SHARE:
