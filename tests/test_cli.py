@@ -258,6 +258,10 @@ def test_an_empty_folder_may_be_used(tmp_path: Path) -> None:
         ([NAME, "--set", "value.size=5"], "value.size"),
         ([NAME, "--set", "value=none"], "value"),
         ([NAME, "--set", "value=grid", "--set", "value.max_rank=5"], "value.max_rank"),
+        (
+            [NAME, "--set", "model_based.max_samples=9", "--set", "model_based=none"],
+            "model_based = None leaves that section out",
+        ),
         ([NAME, "--set", "model_based.acceptance_rollouts=1"], "acceptance_rollouts = 1"),
         ([NAME, "--set", "imagined_noise=1.1"], "model_based.proposal_std_scale"),
         ([NAME, "--set", "kl_bound"], "NAME=VALUE"),

@@ -167,6 +167,15 @@ def test_a_field_of_an_absent_section_adds_the_section() -> None:
     assert settings.low_rank == LowRank(rank=7)
 
 
+def test_a_section_is_not_left_out_and_changed_at_once() -> None:
+    for changes in (
+        {"model_based": None, "model_based.max_samples": 9},
+        {"model_based.max_samples": 9, "model_based": "none"},
+    ):
+        with pytest.raises(ConfigurationError, match=r"max_samples.*one of the two"):
+            changed(Settings(), changes)
+
+
 def test_a_section_is_given_by_the_name_of_its_kind() -> None:
     assert settings_of(value="grid").value == Grid(size=10)
     assert settings_of("paper", value="rkhs").value == RKHS()

@@ -86,7 +86,8 @@ def changed(settings: AnySettings, changes: Mapping[str, Any]) -> AnySettings:
             absent section adds the section with its defaults.
 
     Raises:
-        ConfigurationError: unknown parameter, or a value out of range.
+        ConfigurationError: unknown parameter, a value out of range, or a field of a section that
+            the same changes leave out.
     """
     known = [each.name for each in fields(settings)]
     new: dict[str, Any] = {}
@@ -101,6 +102,11 @@ def changed(settings: AnySettings, changes: Mapping[str, Any]) -> AnySettings:
             continue
         if section not in known or section not in SECTIONS:
             raise ConfigurationError(_unknown(name, value, list(flat(settings))))
+        if section in new and new[section] is None:
+            raise ConfigurationError(
+                f"{name} = {value!r}, but {section} = None leaves that section out; "
+                "give one of the two"
+            )
         new[section] = _with_field(new.get(section, getattr(settings, section)), name, part, value)
     return replace(settings, **new)
 

@@ -60,7 +60,7 @@ def basis_of_value(rows: Sequence[Row]) -> Finding | None:
             rank,
             max_rank,
             f"V has a fixed number of features, {rank}; the error of this choice is not measured.",
-            "more features: a larger value.size, or features of the kernel (--set value=rkhs).",
+            "a larger grid (value.size), or features of the kernel (--set value=rkhs).",
         )
     residual = latest(rows, "rank_residual")
     if rank < max_rank:
