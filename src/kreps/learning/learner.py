@@ -82,7 +82,8 @@ class Learner(Generic[MethodSettings]):
         periodic: coordinates of the observation that are angles in rad; None takes them from
             ``env.metadata["periodic_coordinates"]``.
         threads: BLAS threads while learning; None leaves the number unchanged.  Another number may
-            change the last bits of a policy.
+            change the last bits of a policy, so learners that run at the same time in threads of
+            one process must agree on it.
         **settings: any field of the method's ``settings_type``.
 
     Raises:
@@ -210,7 +211,7 @@ class Learner(Generic[MethodSettings]):
         assert self.env is not None
         for _ in range(iterations):
             started = time.process_time()
-            with blas_threads(self.threads):
+            with blas_threads(self.threads, exact=True):
                 rollouts = self._collect(self.env, on_rollout)
             seconds = time.process_time() - started
             info = self.update(rollouts)
@@ -247,7 +248,7 @@ class Learner(Generic[MethodSettings]):
 
     def _update(self, samples: Any) -> UpdateReport:
         rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
-        with blas_threads(self.threads):
+        with blas_threads(self.threads, exact=True):
             self.state, info = self._updated(samples, rng)
         return info
 
