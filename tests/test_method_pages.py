@@ -1,4 +1,4 @@
-"""The pages of docs/methods: one skeleton, and everything they name must be as they say."""
+"""The pages of docs/methods: the same skeleton, and statements that agree with the code."""
 
 from __future__ import annotations
 
@@ -7,25 +7,25 @@ import inspect
 import operator
 import pkgutil
 import re
-from dataclasses import MISSING, fields, replace
-from functools import partial
+from dataclasses import fields
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import kreps.evaluation
 import numpy as np
 import pytest
 
+from kreps import settings
 from kreps.algorithms import npalp, reps, value_iteration
-from kreps.algorithms.generated import MAX_GENERATED
+from kreps.algorithms.report import UpdateInfo
 from kreps.experiments.search import CANDIDATES
 from kreps.experiments.specs import FIGURES, METHODS
 from kreps.kernels.kernel import IMAGE_BLUR
-from kreps.learning.learner import IterationReport, Learner
+from kreps.learning.learner import IterationReport
 from kreps.learning.methods import LEARNERS
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
-from kreps.settings import PRESETS, Settings
+from kreps.presets import PRESETS, changed, flat
+from kreps.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs/methods"
@@ -54,7 +54,7 @@ METHOD_OF_PAGE = {
     "npalp": "NPALP",
 }
 REPORT_OF_LEARNER: dict[str, type[Any]] = {
-    "reps": reps.UpdateInfo,
+    "reps": UpdateInfo,
     "value-iteration": value_iteration.ValueIterationInfo,
     "grid-value-iteration": value_iteration.ValueIterationInfo,
     "npalp": npalp.NPALPInfo,
@@ -87,12 +87,18 @@ def figures_of(method: str) -> list[str]:
     ]
 
 
-def differ(a: object, b: object, name: str) -> bool:
-    return bool(getattr(a, name) != getattr(b, name))
+def changed_fields(preset: str) -> set[str]:
+    """Names of the fields, sections as a whole, in which a preset differs from the default."""
+    default = Settings()
+    return {
+        f.name
+        for f in fields(Settings)
+        if getattr(PRESETS[preset], f.name) != getattr(default, f.name)
+    }
 
 
 def anchor(heading: str) -> str:
-    """The link to a heading, as GitHub makes it."""
+    """The anchor of a heading, as on GitHub."""
     return re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-")
 
 
@@ -175,7 +181,7 @@ def test_every_equation_names_what_computes_it(page: Path) -> None:
 
 
 @EVERY_PAGE
-def test_the_figures_are_those_that_show_the_method(page: Path) -> None:
+def test_the_figures_are_those_with_the_method(page: Path) -> None:
     text = section(page, "Results")
     wanted = figures_of(METHOD_OF_PAGE[page.stem])
     shown = re.findall(r"<!-- results: (.+?) -->\n.*?\n?<!-- end of results -->", text, re.DOTALL)
@@ -193,7 +199,7 @@ def test_the_commands_are_those_of_the_method(page: Path) -> None:
     trained = re.findall(r"^kreps train \S+ (.*)--out \S+$", text, re.MULTILINE)
     if METHODS[method].learner == "reps":
         (asked,) = trained
-        options = dict(re.findall(r"--(recipe) (\S+)", asked))
+        options = dict(re.findall(r"--(preset) (\S+)", asked))
         options |= dict(re.findall(r"--set (\w+)=(\w+)", asked))
         assert options == dict(METHODS[method].options)
     else:
@@ -206,60 +212,97 @@ def test_the_commands_are_those_of_the_method(page: Path) -> None:
 @EVERY_PAGE
 def test_the_table_of_parameters_agrees_with_the_settings(page: Path) -> None:
     method = METHODS[METHOD_OF_PAGE[page.stem]]
-    settings = LEARNERS[method.learner].settings_type
+    kind = LEARNERS[method.learner].settings_type
     text = section(page, "Parameters")
-    assert f"[`kreps.settings.{settings.__name__}`]" in text
+    assert f"[`kreps.settings.{kind.__name__}`]" in text
     rows = table_rows(text)
     assert all(len(row) == 4 for row in rows)
     shown = {name.strip("`"): ast.literal_eval(default.strip("`")) for name, default, *_ in rows}
-    assert all(f.default is not MISSING for f in fields(settings))
-    wanted = {f.name: f.default for f in fields(settings)}
+    # of the features of V, each page has the parameters of the kind that it is about
+    of_value = {name: value for name, value in method.options.items() if name == "value"}
+    wanted = flat(changed(kind(), of_value))
     assert shown == wanted
     assert all(type(shown[name]) is type(wanted[name]) for name in wanted)
     for name, value in method.options.items():
         assert f'`{name}="{value}"`' in text
 
 
-@pytest.mark.parametrize("recipe", [name for name in PRESETS if name != "default"])
-def test_what_a_recipe_changes_is_said(recipe: str) -> None:
-    changed = {f.name for f in fields(Settings) if differ(PRESETS[recipe], Settings(), f.name)}
+@pytest.mark.parametrize("preset", ["single_step", "paper"])
+def test_the_page_has_the_settings_that_a_preset_changes(preset: str) -> None:
     (sentence,) = re.findall(
-        rf'^`recipe="{recipe}"` changes (.+?);', KERNEL_PAGE, re.MULTILINE | re.DOTALL
+        rf'^`preset="{preset}"` changes (.+?);', KERNEL_PAGE, re.MULTILINE | re.DOTALL
     )
-    assert set(re.findall(r"`(\w+)`", sentence)) == changed
+    assert set(re.findall(r"`(\w+)`", sentence)) == changed_fields(preset)
 
 
-def test_how_the_default_departs_from_the_paper_recipe_is_said() -> None:
-    changed = {f.name for f in fields(Settings) if differ(PRESETS["paper"], Settings(), f.name)}
+def test_the_differences_of_the_default_and_the_preset_paper_are_listed() -> None:
     deviations = (ROOT / "docs/deviations.md").read_text()
-    listed = deviations.split("## What the default recipe changes")[1].split("\n## ")[0]
-    items = re.findall(
-        r'^\d\. `(\w+) = (\S+)`(?: instead of `?([\w."]+\w"?)`?)?', listed, re.MULTILINE
-    )
-    assert {name for name, *_ in items} == changed
-    numbers = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine")
-    assert f"in {numbers[len(changed)]} settings" in listed
+    listed = deviations.split("## What the default preset changes")[1].split("\n## ")[0]
+    items = re.findall(r"^\d\. `(\w+) = ([^`]+)` instead of `([^`]+)`", listed, re.MULTILINE)
+    assert {name for name, *_ in items} == changed_fields("paper")
+    assert "in nine settings" in listed and len(items) == 9
+    names = vars(settings)
     for name, default, paper in items:
-        assert getattr(Settings(), name) == ast.literal_eval(default)
-        if paper:
-            assert getattr(PRESETS["paper"], name) == ast.literal_eval(paper)
+        assert getattr(Settings(), name) == eval(default, dict(names))
+        assert getattr(PRESETS["paper"], name) == eval(paper, dict(names))
 
 
-def test_limits_are_those_of_the_code() -> None:
-    sweeps = f"{value_iteration.MAX_SWEEPS} is the limit"
+def test_the_limits_on_the_pages_are_those_of_the_code() -> None:
+    assert value_iteration.MAX_SWEEPS == 300
     for name in ("value_iteration", "grid_value_iteration"):
-        assert sweeps in (FOLDER / f"{name}.md").read_text()
-    assert f"{npalp.MAX_IMPROVEMENTS} is the limit" in (FOLDER / "npalp.md").read_text()
-    assert f"more than {MAX_SUPPORT} are refused" in KERNEL_PAGE
-    assert f"smoothing of {IMAGE_BLUR:g} of their side" in KERNEL_PAGE
-    assert f"of them but at most {MAX_GENERATED}" in KERNEL_PAGE
-    (least,) = re.findall(
-        r"^   model's own error, .* and at least `(\S+)`:$", KERNEL_PAGE, re.MULTILINE
-    )
-    assert float(least) == reps.MIN_RIDGE
+        assert "300 is the limit" in (FOLDER / f"{name}.md").read_text()
+    assert npalp.MAX_IMPROVEMENTS == 1000
+    assert "1000 is the limit" in (FOLDER / "npalp.md").read_text()
+    words = " ".join(KERNEL_PAGE.split())
+    assert MAX_SUPPORT == 6000
+    assert "more than 6000 raise an error" in words
+    assert IMAGE_BLUR == 0.3
+    assert "smoothing of 0.3 of their side" in words
+    assert settings.ModelBased().max_samples == 20_000
+    assert "at most `model_based.max_samples` (20000)" in words
+    assert reps.MIN_RIDGE == 1e-3
+    assert "and it is at least `1e-3`" in words
 
 
 # ---- metrics, and the example -----------------------------------------------------------------
+
+TINY = {
+    "initial_rollouts": 3,
+    "restart_probability": 0.1,
+    "grid_states": 4,
+    "grid_actions": 3,
+    "value.size": 4,
+    "actions": 5,
+}
+"""Settings of few and short rollouts, and of coarse grids."""
+
+
+class Reduced(ast.NodeTransformer):
+    """Changes the example of a page: few and short rollouts, one update, a short evaluation.
+
+    Args:
+        changes: of the learner's settings.
+    """
+
+    def __init__(self, changes: dict[str, Any]) -> None:
+        self.changes = changes
+
+    def visit_Call(self, node: ast.Call) -> ast.Call:
+        self.generic_visit(node)
+        name = ast.unparse(node.func)
+        if name in {kind.__name__ for kind in LEARNERS.values()}:
+            extra = f"f(**{self.changes!r})"
+        elif name == "learner.learn":
+            node.keywords = [k for k in node.keywords if k.arg != "iterations"]
+            extra = "f(iterations=1, callback=keep, progress=False)"
+        elif name == "evaluate":
+            extra = "f(episodes=2, steps=5)"
+        else:
+            return node
+        call = ast.parse(extra, mode="eval").body
+        assert isinstance(call, ast.Call)
+        node.keywords += call.keywords
+        return node
 
 
 def reported(info: Any, name: str) -> Any:
@@ -267,61 +310,41 @@ def reported(info: Any, name: str) -> Any:
 
 
 @EVERY_PAGE
-def test_the_example_runs_and_reports_what_the_page_explains(
-    page: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_example_runs_and_reports_the_fields_of_the_page(
+    page: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With few and short roll-outs, a coarse grid and one update."""
-    reports: list[IterationReport] = []
-    tiny = {
-        "initial_rollouts": 3,
-        "restart_probability": 0.1,
-        "grid_states": 4,
-        "grid_actions": 3,
-        "grid_size": 4,
-        "actions": 5,
-    }
-    learn = Learner.learn
-
-    def learn_little(self: Learner[Any], iterations: int) -> Learner[Any]:
-        changes = {n: v for n, v in tiny.items() if n in {f.name for f in fields(self.settings)}}
-        self.settings = replace(self.settings, **changes)
-        assert iterations >= 1
-        return learn(self, 1, callback=lambda _, report: reports.append(report), progress=False)
-
-    monkeypatch.setattr(Learner, "learn", learn_little)
-    short = partial(kreps.evaluation.evaluate, episodes=2, steps=5)
-    monkeypatch.setattr(kreps.evaluation, "evaluate", short)
     (code,) = re.findall(
         r"^```python\n(.*?)^```", section(page, "Command"), re.DOTALL | re.MULTILINE
     )
-    found: dict[str, Any] = {}
-    exec(compile(code, str(page), "exec"), found)
+    method = METHODS[METHOD_OF_PAGE[page.stem]]
+    kind = LEARNERS[method.learner]
+    options = {name: value for name, value in method.options.items() if name != "preset"}
+    preset = PRESETS[method.options["preset"]] if "preset" in method.options else None
+    of_method = changed(preset or kind.settings_type(), options)
+    tiny = {name: value for name, value in TINY.items() if name in flat(of_method)}
+    reports: list[IterationReport] = []
+    found: dict[str, Any] = {"keep": lambda _, report: reports.append(report)}
+    tree = ast.fix_missing_locations(Reduced(tiny).visit(ast.parse(code)))
+    exec(compile(tree, str(page), "exec"), found)
 
     learner = found["learner"]
-    method = METHODS[METHOD_OF_PAGE[page.stem]]
-    assert type(learner) is LEARNERS[method.learner]
-    options = dict(method.options)
-    recipe = options.pop("recipe", None)
-    for name, value in options.items():
-        assert getattr(learner.settings, name) == value
-    if recipe is not None:
-        protocol = {"exploration", "exploration_scale"}
-        changed = {
-            f.name for f in fields(Settings) if differ(learner.settings, PRESETS[recipe], f.name)
-        }
-        assert changed <= options.keys() | tiny.keys() | protocol
+    assert type(learner) is kind
+    ours, theirs = flat(learner.settings), flat(changed(of_method, tiny))
+    differing = {name for name in ours if ours[name] != theirs[name]}
+    of_example = {"exploration.noise", "exploration.scale", "ranges", "lipschitz"}
+    assert differing <= of_example
     assert np.isfinite([float(word) for word in capsys.readouterr().out.split()]).all()
 
     (report,) = reports
-    kind = REPORT_OF_LEARNER[method.learner]
-    assert type(report.update) is kind
+    info = REPORT_OF_LEARNER[method.learner]
+    assert type(report.update) is info
     text = section(page, "Metrics")
-    assert f"[`{kind.__module__}.{kind.__name__}`]" in text
+    assert f"[`{info.__module__}.{info.__name__}`]" in text
     rows = table_rows(text)
     assert all(len(row) == 3 for row in rows)
     explained = [row[0].strip("`") for row in rows]
     for name in explained:
         reported(report.update, name)
     assert set(report.update.numbers()) <= {name.rpartition(".")[2] for name in explained}
-    if page.stem not in ("sample_model", "feature_reps"):  # they refer to the first page
-        assert {f.name for f in fields(kind)} - {"dual"} <= set(explained)
+    if page.stem not in ("sample_model", "feature_reps"):  # these refer to the first page
+        assert {f.name for f in fields(info)} - {"dual"} <= set(explained)
