@@ -45,10 +45,10 @@ class OneStateAtATime:
         return np.concatenate([self.policy.act(s, z) for s, z in pairs])
 
 
-@pytest.mark.parametrize(("greedy", "asked"), [(True, 0.1), (False, 1.0)])
+@pytest.mark.parametrize(("greedy", "limit"), [(True, 0.1), (False, 1.0)])
 @pytest.mark.parametrize(("kernel", "stretch"), [("learnt", 1.0), ("rough", 0.05)])
 def bench_predict(
-    measure: Measure, kernel: str, stretch: float, greedy: bool, asked: float
+    measure: Measure, kernel: str, stretch: float, greedy: bool, limit: float
 ) -> None:
     """With a rough kernel no support point can be predicted from the others."""
     policy = Policy(policy_with_support(SUPPORT, stretch))
@@ -57,7 +57,7 @@ def bench_predict(
         f"predict, {'greedy' if greedy else 'with noise'}, {kernel} kernel",
         f"{SUPPORT} support points",
         lambda: policy.predict(observation, deterministic=greedy),
-        Milliseconds99(at_most=asked),
+        Milliseconds99(at_most=limit),
         rounds=3000,
     )
 

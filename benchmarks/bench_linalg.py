@@ -27,18 +27,18 @@ def positive_definite(n: int) -> FloatArray:
     return a
 
 
-@pytest.mark.parametrize(("n", "asked"), [(500, None), (1500, 0.55), (3000, 0.65), (6000, 0.75)])
-def bench_cholesky(measure: Measure, n: int, asked: float | None) -> None:
+@pytest.mark.parametrize(("n", "limit"), [(500, None), (1500, 0.55), (3000, 0.65), (6000, 0.75)])
+def bench_cholesky(measure: Measure, n: int, limit: float | None) -> None:
     a = positive_definite(n)
-    work = Share(flops.cholesky(n), at_least=asked)
+    work = Share(flops.cholesky(n), at_least=limit)
     measure("Cholesky", f"n = {n}", lambda: cholesky(a), work)
 
 
-@pytest.mark.parametrize(("n", "asked"), [(1500, 0.6), (3000, 0.7)])
-def bench_solve(measure: Measure, n: int, asked: float) -> None:
+@pytest.mark.parametrize(("n", "limit"), [(1500, 0.6), (3000, 0.7)])
+def bench_solve(measure: Measure, n: int, limit: float) -> None:
     factor = cholesky(positive_definite(n))
     b = RNG.standard_normal((n, n))
-    work = Share(flops.solve(n, n), at_least=asked)
+    work = Share(flops.solve(n, n), at_least=limit)
     measure("solve, n right-hand sides", f"n = {n}", lambda: factor.solve(b), work)
 
 
@@ -95,5 +95,5 @@ def bench_pivoted_cholesky(measure: Measure) -> None:
 def bench_symmetric_product(measure: Measure) -> None:
     phi = np.random.default_rng(2).standard_normal((ROWS, 1000))
     nominal = flops.product(1000, 1000, ROWS)
-    asked = Share(nominal, nominal=True, at_least=1.4)
-    measure("Phi'Phi", f"n = {ROWS:,}, rank 1000", lambda: phi.T @ phi, asked)
+    share = Share(nominal, nominal=True, at_least=1.4)
+    measure("Phi'Phi", f"n = {ROWS:,}, rank 1000", lambda: phi.T @ phi, share)

@@ -20,7 +20,8 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from peers import MARKS, TASKS, Stopwatch, Trial, add_tasks, model_of, positive, seeds_of, write
+from peers import add_tasks, positive, seeds_of, write
+from peers_trials import MARKS, TASKS, Stopwatch, Trial, model_of
 
 import kreps
 from kreps.experiments.provenance import commit
