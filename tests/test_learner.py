@@ -228,6 +228,55 @@ def test_a_callback_that_returns_false_stops_learning_after_all_were_called() ->
     assert seen == [1, 2]
 
 
+@pytest.mark.parametrize("false", [np.False_, np.array(False), np.mean([1.0]) > 2.0])
+def test_a_callback_may_return_the_false_of_numpy(false: Any) -> None:
+    learner = swing_up().learn(3, callback=lambda learner, report: false, progress=False)
+    assert learner.state.iteration == 1
+
+
+@pytest.mark.parametrize("other", [np.True_, None, 0, 0.0, np.float64(0.0), [], np.zeros(2)])
+def test_whatever_else_a_callback_returns_does_not_stop_learning(other: Any) -> None:
+    learner = swing_up().learn(2, callback=[lambda learner, report: other], progress=False)
+    assert learner.state.iteration == 2
+
+
+@pytest.mark.parametrize("callback", [None, (), []])
+def test_there_may_be_no_callback(callback: Any) -> None:
+    assert swing_up().learn(1, callback=callback, progress=False).state.iteration == 1
+
+
+class Stop:
+    """A callback whose constructor takes as many arguments as a callback is called with."""
+
+    def __init__(self, reward: float, patience: int) -> None: ...
+
+    def __call__(self, learner: kreps.KREPS, report: IterationReport) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("callback", "says"),
+    [
+        (7, r"callback = 7"),
+        (object(), "must be a function of learner and report"),
+        ([None], "callback = None"),
+        ("stop", "callback = 's'"),
+        (Stop, "give an object of it"),
+        ([Stop(1.0, 2), Stop], "give an object of it"),
+        (lambda report: None, "too many positional arguments"),
+        (lambda learner, report, more: None, "missing a required argument: 'more'"),
+    ],
+)
+def test_a_wrong_callback_is_refused_before_anything_is_collected(callback: Any, says: str) -> None:
+    env = Unstarted(gym.make("kreps/SwingUp-v0"))
+    with pytest.raises(ConfigurationError, match=says):
+        kreps.KREPS(env, **TINY).learn(1, callback=callback, progress=False)
+
+
+class Unstarted(gym.Wrapper[Any, Any, Any, Any]):
+    def reset(self, **options: Any) -> Any:
+        raise AssertionError("the environment was started")
+
+
 def test_an_exception_in_a_callback_keeps_the_update() -> None:
     def fail(learner: kreps.KREPS, report: IterationReport) -> None:
         raise RuntimeError("disk full")

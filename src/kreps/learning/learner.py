@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -64,8 +65,43 @@ class IterationReport:
     rollout_seconds: float
 
 
-Callback = Callable[[Any, IterationReport], bool | None]
+Callback = Callable[[Any, IterationReport], bool | np.bool | None]
 """Called with learner and report after each iteration; returning False stops learning early."""
+
+
+def _callbacks(given: Any) -> list[Callback]:
+    """The callbacks of an argument of `Learner.learn`."""
+    if given is None:
+        return []
+    try:
+        callbacks = [given] if callable(given) else list(given)
+    except TypeError:
+        callbacks = [given]
+    for each in callbacks:
+        if not callable(each) or isinstance(each, type):
+            raise ConfigurationError(
+                f"callback = {each!r:.60}, but it must be a function of learner and report, a list "
+                "of them, or None"
+                + ("; this is a class, so give an object of it" if isinstance(each, type) else "")
+            )
+        try:
+            inspect.signature(each).bind(None, None)
+        except ValueError:  # a function of C without a signature
+            continue
+        except TypeError as error:
+            raise ConfigurationError(
+                f"callback = {each!r:.60} cannot be called with learner and report ({error}); give "
+                "it these two arguments"
+            ) from error
+    return callbacks
+
+
+def _is_false(answer: Any) -> bool:
+    """Whether a callback returned False: Python's, NumPy's, or that of another array library."""
+    if getattr(answer, "ndim", None) == 0:
+        answer = answer.item()
+    return answer is False
+
 
 MethodSettings = TypeVar("MethodSettings", bound=LearnerSettings)
 OnPolicy = TypeVar("OnPolicy", bound=OnPolicySettings)
@@ -171,18 +207,20 @@ class Learner(Generic[MethodSettings]):
         self,
         iterations: int = 20,
         *,
-        callback: Callback | Sequence[Callback] = (),
+        callback: Callback | Sequence[Callback] | None = None,
         progress: bool = True,
     ) -> Self:
         """Collect rollouts of the current policy and update, ``iterations`` times.
 
         Args:
             iterations: number of updates.
-            callback: one callable or several, called in order after each iteration.
+            callback: one callable or several, called in order with learner and report after each
+                iteration.  If one returns False, all others are called and learning ends.
             progress: whether to show a live table (in a terminal) or to print a line per iteration.
 
         Raises:
-            ConfigurationError: the learner was made without an environment.
+            ConfigurationError: the learner was made without an environment, or an argument is not
+                what is described here; nothing was collected then.
             EnvironmentFailure: the environment raised an exception.  The learner is left as it was
                 after the last update.
             DataError: the environment returned NaN, infinities or wrong shapes.  The learner is
@@ -194,7 +232,7 @@ class Learner(Generic[MethodSettings]):
                 "in; pass rollouts to update(), or make the learner from an environment"
             )
         iterations = _whole_number("iterations", iterations)
-        callbacks = [callback] if callable(callback) else list(callback)
+        callbacks = _callbacks(callback)
         if progress:
             from kreps.learning.progress import ProgressTable
 
@@ -223,7 +261,7 @@ class Learner(Generic[MethodSettings]):
                 update=info,
                 rollout_seconds=seconds,
             )
-            if any([each(self, report) is False for each in callbacks]):
+            if any([_is_false(each(self, report)) for each in callbacks]):
                 break
         return self
 
