@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -362,6 +363,43 @@ def test_stochastic_prediction_differs_from_call_to_call(learnt: kreps.KREPS) ->
 def test_predict_of_the_learner_differs_from_call_to_call_too(learnt: kreps.KREPS) -> None:
     actions = [float(learnt.predict([np.pi, 0.0])[0][0]) for _ in range(300)]
     assert len(set(actions)) > 3
+
+
+@dataclass(frozen=True)
+class Noise:
+    """A policy whose actions are the numbers it explores with."""
+
+    task: TaskSpec
+
+    def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
+        return noise
+
+
+def noise_after(updates: int, learner: kreps.KREPS) -> FloatArray:
+    """The first five numbers that `predict` explores with after so many updates."""
+    policy: Any = Noise(learner.task)
+    learner.state = dataclasses.replace(learner.state, policy=policy, iteration=updates)
+    return np.array([learner.predict([3.0, 0.0])[0] for _ in range(5)])
+
+
+def test_exploration_noise_does_not_begin_anew_after_an_update() -> None:
+    learner = swing_up()
+    numbers = [noise_after(updates, learner) for updates in (1, 2, 3)]
+    assert len(np.unique(numbers)) == 15
+    # addressed by the iteration, so that a resumed learner explores with the same numbers
+    np.testing.assert_array_equal(noise_after(2, swing_up()), numbers[1])
+    assert not np.isin(noise_after(2, swing_up(seed=1)), numbers).any()
+
+
+def test_exploration_noise_goes_on_between_two_updates_and_is_new_after_a_rejected_one() -> None:
+    learner = swing_up()
+    first = noise_after(1, learner)
+    process = learner.policy.process
+    more = learner.predict([3.0, 0.0])[0]
+    assert more not in first
+    learner.state = dataclasses.replace(learner.state, iteration=2)  # the same policy acts
+    assert learner.policy.process is process
+    assert learner.predict([3.0, 0.0])[0] not in [*first, more]
 
 
 def test_actions_are_clipped_to_the_limits(learnt: kreps.KREPS) -> None:

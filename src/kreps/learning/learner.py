@@ -199,9 +199,10 @@ class Learner(Generic[MethodSettings]):
             raise ConfigurationError(
                 "there is no policy before the first update; call learn() or update()"
             )
-        if self._policy is None or self._policy.process is not self.state.policy:
-            self._policy = Policy(self.state.policy, self.seed)
-        return self._policy
+        policy, process, iteration = self._policy, self.state.policy, self.state.iteration
+        if policy is None or policy.process is not process or policy.iteration != iteration:
+            self._policy = policy = Policy(process, self.seed, iteration)
+        return policy
 
     def learn(
         self,
@@ -307,7 +308,7 @@ class Learner(Generic[MethodSettings]):
         episode_start: Any = None,
         deterministic: bool = False,
     ) -> tuple[FloatArray, Any]:
-        """`kreps.Policy.predict` of the current policy."""
+        """`kreps.Policy.predict` of the current policy, with noise of its own after each update."""
         return self.policy.predict(observation, state, episode_start, deterministic)
 
     def save(self, path: str | Path) -> None:

@@ -24,13 +24,15 @@ class Policy:
 
     Args:
         process: the distribution of actions, for KREPS a cost-sensitive Gaussian process.
-        seed: of the exploration noise in `predict`.
+        seed, iteration: address the exploration noise in `predict`.  Policies of one seed explore
+            with the same numbers unless their iterations differ.
     """
 
-    def __init__(self, process: LearntPolicy, seed: int = 0) -> None:
+    def __init__(self, process: LearntPolicy, seed: int = 0, iteration: int = 0) -> None:
         self.process = process
         self.seed = seed
-        self._noise = generator(seed, Purpose.PREDICT)
+        self.iteration = iteration
+        self._noise = generator(seed, Purpose.PREDICT, iteration)
 
     def predict(
         self,
@@ -93,7 +95,7 @@ class Policy:
             centres: largest number of support points.
 
         Returns:
-            A policy with the same seed, or this policy if it has no more centres.
+            A policy with the same address of its noise, or this policy if it has no more centres.
 
         Raises:
             ConfigurationError: fewer than one centre, or a policy without samples.
@@ -110,7 +112,7 @@ class Policy:
             )
         process = self.process
         if isinstance(process, CostSensitiveGP):
-            return Policy(process.compressed(count), self.seed)
+            return Policy(process.compressed(count), self.seed, self.iteration)
         if not isinstance(process, SparseGP):
             raise ConfigurationError(_no_process(process, "compress"))
         if len(process.states) > count:
@@ -174,7 +176,8 @@ def load_policy(path: str | Path, seed: int = 0) -> Policy:
 
     Args:
         path: of the file.
-        seed: of the exploration noise in `Policy.predict`.
+        seed: of the exploration noise in `Policy.predict`.  Who loads the policy anew after each
+            update needs a new seed each time, or explores with the same numbers again.
 
     Raises:
         StorageError: the file is missing, damaged or not a policy.
