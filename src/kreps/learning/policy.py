@@ -149,7 +149,7 @@ class Policy:
             process = process.predictor
         if not isinstance(process, SparseGP):
             raise ConfigurationError(_no_process(process, "export"))
-        return write_onnx(process, Path(path), dtype)
+        return write_onnx(process, path, dtype)
 
 
 def _no_process(process: LearntPolicy, verb: str) -> str:

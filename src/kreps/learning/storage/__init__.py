@@ -1,11 +1,12 @@
 """Policies, rollouts and checkpoints as files."""
 
+from kreps.learning.storage.atomic import write_atomically
 from kreps.learning.storage.checkpoints import (
     POLICIES_OF_METHOD,
     load_checkpoint,
     save_checkpoint,
 )
-from kreps.learning.storage.files import MAX_FILE_BYTES, VERSION, write_atomically
+from kreps.learning.storage.files import MAX_FILE_BYTES, VERSION
 from kreps.learning.storage.policies import load_policy, save_policy
 from kreps.learning.storage.rollouts import (
     RolloutFile,

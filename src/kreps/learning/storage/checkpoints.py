@@ -98,7 +98,7 @@ def save_checkpoint(
         "seed": seed,
         "state": STATE.encode(state, "", tensors),
     }
-    write_arrays(Path(path), "checkpoint", tensors, header, max_bytes)
+    write_arrays(path, "checkpoint", tensors, header, max_bytes)
 
 
 def load_checkpoint(

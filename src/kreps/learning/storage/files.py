@@ -7,9 +7,8 @@ shapes of its arrays.  Whatever is wrong with it is raised as `StorageError`.
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ import safetensors.numpy
 
 from kreps import legacy
 from kreps.errors import KrepsError, StorageError
+from kreps.learning.storage.atomic import file_path, write_atomically
 from kreps.learning.storage.codec import StoredArrays, Tensors, check_sane
 
 VERSION = 3
@@ -28,31 +28,12 @@ MAX_HEADER_BYTES = 2**22
 Header = dict[str, Any]
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace a file as a whole: at any moment, also if the process is killed, it is old or new.
-
-    Raises:
-        StorageError: the folder does not exist, or cannot be written to.
-    """
-    if not path.name or "\0" in str(path):
-        raise StorageError(f"{str(path)!r} does not name a file")
-    part = path.with_name(f".{path.name}.part")
-    try:
-        with open(part, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            part.unlink()
-        raise StorageError(
-            f"cannot write {path}: {error}; check the folder and its space"
-        ) from error
-
-
 def write_arrays(
-    path: Path, kind: str, tensors: Tensors, header: Header, max_bytes: int = MAX_FILE_BYTES
+    path: str | Path,
+    kind: str,
+    tensors: Tensors,
+    header: Header,
+    max_bytes: int = MAX_FILE_BYTES,
 ) -> None:
     """Write arrays and a JSON header.  The same content gives the same bytes.
 
@@ -66,6 +47,7 @@ def write_arrays(
     Raises:
         StorageError: the file cannot be written, or would be too large to be read.
     """
+    path = file_path(path)
     text = json.dumps({"kind": kind, "version": VERSION, **header}, sort_keys=True)
     limit = MAX_HEADER_BYTES // 2  # quoting in the file may double it
     if len(text) > limit:
@@ -94,7 +76,7 @@ def reading(
     Raises:
         StorageError: missing, unreadable, damaged, too large, or of another kind or version.
     """
-    path = Path(path)
+    path = file_path(path)
     try:
         if not path.is_file():
             raise StorageError(f"{path} is not a file; check the path")

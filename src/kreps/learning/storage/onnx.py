@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Factor, Periodic, SmoothedImage, SquaredExponential, smoothing
-from kreps.learning.storage.files import write_atomically
+from kreps.learning.storage.atomic import write_atomically
 from kreps.policies.sparse_gp import SparseGP
 
 OPSET, IR_VERSION = 17, 8
@@ -36,7 +36,7 @@ SINGLE_PRECISION_TOLERANCE = 1e-4
 
 def write_onnx(
     policy: SparseGP,
-    path: Path,
+    path: str | Path,
     dtype: str = "float64",
     tolerance: float = SINGLE_PRECISION_TOLERANCE,
 ) -> str:

@@ -179,7 +179,7 @@ def save_policy(policy: LearntPolicy, path: str | Path, max_bytes: int = MAX_FIL
         "task": TASK.encode(policy.task, "task", tensors),
         "policy": POLICY.encode(policy, "policy", tensors),
     }
-    write_arrays(Path(path), "policy", tensors, header, max_bytes)
+    write_arrays(path, "policy", tensors, header, max_bytes)
 
 
 def load_policy(path: str | Path) -> LearntPolicy:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Any
 from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.errors import DataError, StorageError
+from kreps.learning.storage.atomic import given_path
 from kreps.learning.storage.codec import Array, Converted, Record, Tensors
 from kreps.learning.storage.files import MAX_FILE_BYTES, reading, write_arrays
 
@@ -58,7 +60,7 @@ def save_rollouts(
         raise DataError("there is no rollout to save; give at least one")
     tensors: Tensors = {}
     header = {"steps": flat.steps, "rollouts": ROLLOUTS.encode(flat, "rollouts", tensors)}
-    write_arrays(Path(path), "rollouts", tensors, header, max_bytes)
+    write_arrays(path, "rollouts", tensors, header, max_bytes)
 
 
 def load_rollouts(path: str | Path) -> Rollouts:
@@ -103,13 +105,17 @@ class RolloutFile:
 def rollout_folder(path: str | Path) -> Dataset:
     """The files of rollouts (``*.safetensors``) in a folder, in the order of their names.
 
+    Hidden files are no part of it, such as the ``._`` companions that macOS leaves beside copies.
+
     Raises:
         StorageError: no such folder, or a file in it that is damaged or foreign.
     """
-    folder = Path(path).resolve()  # other processes may have another working directory
-    if not folder.is_dir():
+    # other processes may have another working directory
+    folder = Path(os.path.realpath(given_path(path)))
+    if not os.path.isdir(folder):  # noqa: PTH112 (a name that is too long is no error of its own)
         raise StorageError(f"{folder} is not a folder; check the path")
-    files = sorted(folder.glob("*.safetensors"))
+    found = folder.glob("*.safetensors")
+    files = sorted(file for file in found if not file.name.startswith("."))
     if not files:
         raise StorageError(
             f"{folder} holds no *.safetensors; write rollouts there with kreps.save_rollouts"
