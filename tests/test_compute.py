@@ -1,4 +1,4 @@
-"""Who works on the chunks: order, bounds, errors, and the same policy from every executor."""
+"""Executors: order and number of chunks, errors, and the same policy from every executor."""
 
 from __future__ import annotations
 
@@ -17,9 +17,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import kreps
-from kreps.algorithms import low_rank
-from kreps.data import dataset as dataset_module
-from kreps.data.compute import MAX_PENDING, Compute
+from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
@@ -37,7 +35,7 @@ def threads() -> Iterator[Executor]:
 
 
 class Recorder(Executor):
-    """Does at once what it is given, and counts it."""
+    """Computes each submitted call at once, and counts them."""
 
     def __init__(self) -> None:
         self.submitted = 0
@@ -52,7 +50,7 @@ class Recorder(Executor):
 # ---- order, bounds, errors --------------------------------------------------------------------
 
 
-def test_results_come_in_the_order_of_the_arguments_whoever_was_first(threads: Executor) -> None:
+def test_results_are_in_the_order_of_the_arguments(threads: Executor) -> None:
     finished: list[int] = []
 
     def slow_at_first(i: int, name: str) -> tuple[int, str]:
@@ -67,46 +65,44 @@ def test_results_come_in_the_order_of_the_arguments_whoever_was_first(threads: E
 
 
 @pytest.mark.parametrize("executor", [None, Recorder()], ids=["here", "executor"])
-@pytest.mark.parametrize(
-    "count", [0, 1, MAX_PENDING - 1, MAX_PENDING, MAX_PENDING + 1, 3 * MAX_PENDING]
-)
+@pytest.mark.parametrize("count", [0, 1, 15, 16, 17, 48])
 def test_every_argument_has_its_result(executor: Executor | None, count: int) -> None:
     assert list(Compute(executor).map(str, range(count))) == [str(i) for i in range(count)]
 
 
-def test_no_more_chunks_are_under_way_than_agreed() -> None:
+def test_at_most_sixteen_chunks_are_pending() -> None:
     recorder, asked = Recorder(), []
 
     def arguments() -> Iterator[int]:
-        for i in range(5 * MAX_PENDING):
+        for i in range(80):
             asked.append(i)
             yield i
 
     results = Compute(recorder).map(abs, arguments())
-    for taken in range(5 * MAX_PENDING):
-        assert recorder.submitted == min(taken + MAX_PENDING - 1 if taken else 0, 5 * MAX_PENDING)
-        assert len(asked) == recorder.submitted  # not even the arguments are made before
+    for taken in range(80):
+        assert recorder.submitted == min(taken + 15 if taken else 0, 80)
+        assert len(asked) == recorder.submitted  # arguments are taken as late as possible
         next(results)
 
 
-def test_no_more_workers_are_busy_than_agreed(threads: Executor) -> None:
-    lock, busy, most = threading.Lock(), 0, 0
+def test_at_most_sixteen_workers_are_busy(threads: Executor) -> None:
+    lock, busy, largest = threading.Lock(), 0, 0
 
     def work(_: int) -> None:
-        nonlocal busy, most
+        nonlocal busy, largest
         with lock:
             busy += 1
-            most = max(most, busy)
+            largest = max(largest, busy)
         time.sleep(0.002)
         with lock:
             busy -= 1
 
     list(Compute(threads).map(work, range(100)))
-    assert 2 <= most <= MAX_PENDING
+    assert 2 <= largest <= 16
 
 
-@pytest.mark.parametrize("where", ["here", "threads"])
-def test_an_error_comes_out_as_it_was_raised(where: str, threads: Executor) -> None:
+@pytest.mark.parametrize("where", ["this process", "threads"])
+def test_an_error_of_a_worker_is_raised(where: str, threads: Executor) -> None:
     def fails_at_seven(i: int) -> int:
         if i == 7:
             raise DataError("seven")
@@ -125,15 +121,8 @@ def test_an_error_comes_out_as_it_was_raised(where: str, threads: Executor) -> N
 
 @pytest.fixture(scope="module")
 def rollouts() -> list[Rollout]:
-    return collect(
-        gym.make("kreps/SwingUp-v0"),
-        TASK,
-        BangBang(TASK),
-        6,
-        seed=1,
-        iteration=0,
-        restart_probability=0.02,
-    )
+    env, policy = gym.make("kreps/SwingUp-v0"), BangBang(TASK)
+    return list(collect(env, TASK, policy, 6, seed=1, iteration=0, restart_probability=0.02))
 
 
 @pytest.fixture
@@ -143,11 +132,8 @@ def folder(rollouts: list[Rollout], tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.fixture(autouse=True)
-def streamed(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Chunks so short, and samples so few, that every sum is taken over several chunks."""
-    monkeypatch.setattr(dataset_module, "CHUNK", 100)
-    monkeypatch.setattr(low_rank, "SAMPLE", 200)
+CHUNK_SIZE = 100
+"""So short that every sum is taken over several chunks."""
 
 
 def allow_two_blas_threads() -> None:
@@ -160,22 +146,25 @@ def blas_threads_used(*_: int) -> set[int]:
 
 @pytest.fixture(scope="module")
 def processes() -> Iterator[Executor]:
-    """Two workers, left to themselves with two BLAS threads each."""
+    """Two workers with two BLAS threads each, unless limited."""
     with ProcessPoolExecutor(
         2, mp_context=get_context("spawn"), initializer=allow_two_blas_threads
     ) as pool:
         yield pool
 
 
-def test_chunks_are_worked_on_by_one_blas_thread(processes: Executor) -> None:
+def test_a_worker_process_uses_one_blas_thread(processes: Executor) -> None:
     assert list(Compute(processes).map(blas_threads_used, range(4))) == [{1}] * 4
     assert processes.submit(blas_threads_used).result() == {2}
 
 
 def learnt(given: Dataset | list[Rollout], executor: Executor | None, path: Path) -> bytes:
-    """All that is learnt, as a file."""
+    """A checkpoint after one update, in which the dual is solved in chunks."""
     learner = kreps.KREPS(
-        TASK, approximation="pivoted", max_rank=60, rank=60, compute=Compute(executor)
+        TASK,
+        value=kreps.RKHS(max_rank=60),
+        low_rank=kreps.LowRank(rank=60, above=0, subsample=200),
+        compute=Compute(executor, chunk_size=CHUNK_SIZE),
     )
     learner.update(given)
     learner.save(path)
@@ -183,17 +172,18 @@ def learnt(given: Dataset | list[Rollout], executor: Executor | None, path: Path
 
 
 @pytest.mark.parametrize("form", ["list", "set", "arrays", "folder"])
-def test_processes_learn_the_same_policy_to_the_last_byte(
+def test_processes_learn_the_same_policy_byte_for_byte(
     form: str, rollouts: list[Rollout], folder: Path, processes: Executor
 ) -> None:
     given: Dataset | list[Rollout] = {
         "list": lambda: rollouts,
-        "set": lambda: Dataset.from_rollouts(rollouts),
+        "set": lambda: Dataset.from_rollouts(rollouts, chunk_size=CHUNK_SIZE),
         "arrays": lambda: Dataset.from_arrays(
             np.concatenate([r.observations for r in rollouts]),
             np.concatenate([r.actions for r in rollouts]),
             np.concatenate([r.rewards for r in rollouts]),
             [len(r) for r in rollouts],
+            chunk_size=CHUNK_SIZE,
         ),
         "folder": lambda: kreps.rollout_folder(folder),
     }[form]()
@@ -215,7 +205,7 @@ def test_a_dask_cluster_learns_the_same_policy(folder: Path) -> None:
     assert there == here
 
 
-def test_a_chunk_that_a_worker_cannot_read_ends_the_update(
+def test_a_chunk_that_cannot_be_read_is_an_error_of_the_update(
     folder: Path, processes: Executor
 ) -> None:
     files = kreps.rollout_folder(folder)
@@ -226,6 +216,6 @@ def test_a_chunk_that_a_worker_cannot_read_ends_the_update(
     assert learner.state.iteration == 0
 
 
-def test_what_is_sent_to_a_worker_does_not_hold_the_files_it_reads(folder: Path) -> None:
+def test_a_pickled_chunk_does_not_contain_its_file(folder: Path) -> None:
     chunk = kreps.rollout_folder(folder).chunks[0]
     assert len(pickle.dumps(chunk)) < 1000

@@ -1,4 +1,4 @@
-"""Kernels of images, the shape of images in a task, and what the embedding is counted from."""
+"""Kernels of images, the shape of images in a task, and the origin of the embedding."""
 
 from __future__ import annotations
 
@@ -12,12 +12,16 @@ import pytest
 from scipy.ndimage import gaussian_filter
 
 import kreps
-from kreps.algorithms import reps
+from kreps.algorithms.state import LearnerState
+from kreps.algorithms.update import batch_of
+from kreps.data.compute import Compute
 from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
+from kreps.data.window import ReplayWindow
 from kreps.envs.image_swing_up import PIXELS, image
 from kreps.errors import ConfigurationError, StorageError
 from kreps.kernels.arrays import FloatArray
+from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.gram import squared_distances
 from kreps.kernels.kernel import (
     IMAGE_BLUR,
@@ -28,8 +32,8 @@ from kreps.kernels.kernel import (
     median_lengthscales,
 )
 from kreps.kernels.regression import KernelEmbedding, SampleModel
-from kreps.models.transition import state_kernel, successor_features
-from kreps.settings import Settings, settings_of
+from kreps.models.transition import embedding_origin, state_kernel, successor_features
+from kreps.presets import settings_of
 
 ALL = tuple(range(PIXELS**2))
 SMOOTHED = SmoothedImage(ALL, (PIXELS, PIXELS))
@@ -67,7 +71,7 @@ def test_gram_matrices_are_positive_semi_definite(shape: tuple[int, int]) -> Non
 
 
 @pytest.mark.parametrize("shape", [(20, 20), (7, 12), (12, 7)])
-def test_distances_are_those_of_an_explicitsmoothing(shape: tuple[int, int]) -> None:
+def test_distances_are_those_of_explicitly_smoothed_images(shape: tuple[int, int]) -> None:
     height, width = shape
     x = np.random.default_rng(1).normal(size=(5, height * width))
     found = SmoothedImage(tuple(range(height * width)), shape).coordinates(x)
@@ -86,13 +90,13 @@ def test_distances_are_those_of_an_explicitsmoothing(shape: tuple[int, int]) -> 
     np.testing.assert_allclose(found @ found.T, inner, atol=1e-6 * np.abs(inner).max())
 
 
-def test_an_image_may_lie_anywhere_among_the_coordinates() -> None:
+def test_an_image_may_be_any_group_of_coordinates() -> None:
     rng = np.random.default_rng(2)
     dims = tuple(range(6, 18))
     x = rng.normal(size=(4, 20))
     alone = SmoothedImage(tuple(range(12)), (3, 4)).coordinates(x[:, dims])
     np.testing.assert_array_equal(SmoothedImage(dims, (3, 4)).coordinates(x), alone)
-    # rows are rows: a pixel spreads to its neighbour in the column, not to the next number
+    # pixels are smoothed along rows and columns, not along their numbers
     pixels = SmoothedImage(tuple(range(20)), (10, 2)).coordinates(np.eye(20))
     tall = (pixels @ pixels[0]).reshape(10, 2)  # how much of each the first one has
     assert (tall[:, 1] < tall[:, 0]).all()
@@ -113,7 +117,7 @@ def test_smoothing_is_linear() -> None:
 def test_distances_grow_with_the_angle_where_raw_ones_saturate(start: float) -> None:
     smoothed, raw = (distances_from_start(f, start) for f in (SMOOTHED, RAW))
     quarter = DEGREES <= 90
-    # from 60 to 90 degrees: another third, where raw pictures have nothing left to say
+    # from 60 to 90 degrees: a third more, where distances of raw images no longer grow
     growth = {}
     for name, distances in (("smoothed", smoothed), ("raw", raw)):
         growth[name] = distances[DEGREES == 90].item() / distances[DEGREES == 60].item()
@@ -124,7 +128,7 @@ def test_distances_grow_with_the_angle_where_raw_ones_saturate(start: float) -> 
     assert np.abs(smoothed - chord).max() < 0.12 < 0.35 < np.abs(raw - chord).max()
 
 
-def test_the_shares_are_those_of_the_page() -> None:
+def test_the_relative_distances_are_those_of_the_documentation() -> None:
     at = np.isin(DEGREES, (30, 90))
     np.testing.assert_allclose(distances_from_start(RAW, 0.0)[at], [0.65, 0.98], atol=0.006)
     np.testing.assert_allclose(distances_from_start(SMOOTHED, 0.0)[at], [0.34, 0.75], atol=0.006)
@@ -133,7 +137,7 @@ def test_the_shares_are_those_of_the_page() -> None:
 
 
 @pytest.mark.parametrize("velocity", [2.0, 5.0, 8.0])
-def test_difference_images_of_one_speed_are_told_apart_too(velocity: float) -> None:
+def test_difference_images_of_one_speed_are_distinguished(velocity: float) -> None:
     """Raw ones are as far apart at 30 degrees as on opposite sides; smoothed ones are not."""
     angles = np.deg2rad(np.arange(0.0, 360.0, 15.0))
 
@@ -176,19 +180,19 @@ def test_an_image_shape_makes_smoothed_factors() -> None:
 @pytest.mark.parametrize(
     ("shape", "changes", "message"),
     [
-        ((2, 2), {}, "each must be an image of 2 x 2"),
-        ((3, 4), {}, "each must be an image of 3 x 4"),
-        ((2, 3), {"groups": ()}, "all in one"),
-        ((2, 3), {"groups": (tuple(range(6)),)}, "all in one"),
-        ((2, 3), {"groups": (tuple(range(6)), tuple(range(6, 11)))}, "each must be an image"),
-        ((2, 3), {"observation_size": 13}, "all in one"),
+        ((2, 2), {}, "each group must be an image of 2 x 2"),
+        ((3, 4), {}, "each group must be an image of 3 x 4"),
+        ((2, 3), {"groups": ()}, "each coordinate must be in a group"),
+        ((2, 3), {"groups": (tuple(range(6)),)}, "each coordinate must be in a group"),
+        ((2, 3), {"groups": (tuple(range(6)), tuple(range(6, 11)))}, "each group must be an image"),
+        ((2, 3), {"observation_size": 13}, "each coordinate must be in a group"),
         ((2.5, 3), {}, "whole number"),
         ((2, 3, 1), {}, "whole number"),
         (6, {}, "whole number"),
         ("ab", {}, "whole number"),
     ],
 )
-def test_a_shape_that_does_not_fit_is_refused(
+def test_a_shape_that_does_not_fit_is_an_error(
     shape: Any, changes: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ConfigurationError, match=message):
@@ -201,10 +205,10 @@ def rollouts_of_images(count: int, rng: np.random.Generator) -> list[Rollout]:
     for _ in range(count):
         actions = rng.uniform(-1.0, 1.0, size=(8, 1))
         steps = actions[:, 0] + 0.3 * rng.normal(size=8)
-        state_sources = np.clip(np.concatenate([[2.5], 2.5 + np.cumsum(steps)]), 0.0, 5.0)
-        pictures = np.exp(-((state_sources[:, None] - np.arange(6)) ** 2))
+        positions = np.clip(np.concatenate([[2.5], 2.5 + np.cumsum(steps)]), 0.0, 5.0)
+        pictures = np.exp(-((positions[:, None] - np.arange(6)) ** 2))
         observations = np.concatenate([pictures, np.diff(pictures, axis=0, prepend=0.0)], axis=1)
-        rollouts.append(Rollout(observations, actions, -((state_sources[:-1] - 2.5) ** 2)))
+        rollouts.append(Rollout(observations, actions, -((positions[:-1] - 2.5) ** 2)))
     return rollouts
 
 
@@ -215,7 +219,7 @@ def learnt() -> kreps.KREPS:
     return learner
 
 
-def test_the_shape_comes_back_from_a_policy_file(learnt: kreps.KREPS, tmp_path: Path) -> None:
+def test_the_shape_is_restored_from_a_policy_file(learnt: kreps.KREPS, tmp_path: Path) -> None:
     learnt.policy.save(tmp_path / "policy")
     again = kreps.load_policy(tmp_path / "policy").process
     assert again.task.image_shape == (1, 6)
@@ -225,7 +229,7 @@ def test_the_shape_comes_back_from_a_policy_file(learnt: kreps.KREPS, tmp_path: 
     np.testing.assert_array_equal(again.greedy(seen), learnt.state.policy.greedy(seen))
 
 
-def test_the_shape_comes_back_from_a_checkpoint(learnt: kreps.KREPS, tmp_path: Path) -> None:
+def test_the_shape_is_restored_from_a_checkpoint(learnt: kreps.KREPS, tmp_path: Path) -> None:
     learnt.save(tmp_path / "one")
     again = kreps.KREPS.resume(tmp_path / "one")
     assert again.task.image_shape == (1, 6)
@@ -239,17 +243,17 @@ def test_the_shape_comes_back_from_a_checkpoint(learnt: kreps.KREPS, tmp_path: P
     assert (tmp_path / "two").read_bytes() == (tmp_path / "three").read_bytes()
 
 
-def test_no_shape_comes_back_as_none(tmp_path: Path) -> None:
+def test_a_missing_shape_is_restored_as_none(tmp_path: Path) -> None:
     learner = kreps.KREPS(task_of_images(None), seed=1)
     learner.save(tmp_path / "empty")
     assert kreps.KREPS.resume(tmp_path / "empty").task.image_shape is None
 
 
-def test_a_shape_that_lies_is_refused_when_it_is_read(learnt: kreps.KREPS, tmp_path: Path) -> None:
+def test_a_forged_shape_is_an_error_when_it_is_read(learnt: kreps.KREPS, tmp_path: Path) -> None:
     learnt.policy.save(tmp_path / "good")
     content = (tmp_path / "good").read_bytes()
-    for lie in (b"[1, 9]", b"[-1,6]"):
-        forged = content.replace(rb"\"image_shape\": [1, 6]", rb"\"image_shape\": " + lie)
+    for shape in (b"[1, 9]", b"[-1,6]"):
+        forged = content.replace(rb"\"image_shape\": [1, 6]", rb"\"image_shape\": " + shape)
         assert forged != content
         (tmp_path / "bad").write_bytes(forged)
         with pytest.raises(StorageError, match="image_shape"):
@@ -257,12 +261,12 @@ def test_a_shape_that_lies_is_refused_when_it_is_read(learnt: kreps.KREPS, tmp_p
 
 
 @pytest.mark.parametrize("shape", [(-1, -6), (1, 2000), (6,), "ab", (0, 6), (1.0, 6)])
-def test_impossible_shapes_are_named(shape: Any) -> None:
+def test_impossible_shapes_are_named_in_the_error(shape: Any) -> None:
     with pytest.raises(ConfigurationError, match="image_shape"):
         TaskSpec(6, np.zeros(1), np.ones(1), groups=(range(6),), image_shape=shape)
 
 
-def test_the_environment_tells_the_shape() -> None:
+def test_the_shape_is_taken_from_the_environment() -> None:
     learner = kreps.KREPS(gym.make("kreps/ImageSwingUp-v0"))
     assert learner.task.image_shape == (PIXELS, PIXELS)
     groups = learner.task.groups
@@ -270,20 +274,20 @@ def test_the_environment_tells_the_shape() -> None:
     assert kreps.KREPS(gym.make("kreps/SwingUp-v0")).task.image_shape is None
 
 
-# ---- what the embedding is counted from -------------------------------------------------------
+# ---- the origin of the embedding --------------------------------------------------------------
 
 TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
 
 
-def some_transitions(rng: np.random.Generator, far: float = 0.0) -> Transitions:
-    """Three roll-outs of random walks; the last one starts ``far`` away from the others."""
+def random_walks(rng: np.random.Generator, far: float = 0.0) -> list[Rollout]:
+    """Three rollouts; the last one starts ``far`` away from the others."""
     rollouts = []
     for shift in (0.0, 0.0, far):
         actions = rng.uniform(-1.0, 1.0, size=(10, 1))
         steps = np.concatenate([actions, 0.3 * rng.normal(size=(10, 1))], axis=1)
         observations = shift + np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
         rollouts.append(Rollout(observations, actions, -np.abs(observations[:-1, 0])))
-    return Transitions.from_rollouts(rollouts)
+    return rollouts
 
 
 def embedding_of(data: Transitions, regulariser: float) -> KernelEmbedding:
@@ -294,35 +298,57 @@ def embedding_of(data: Transitions, regulariser: float) -> KernelEmbedding:
 def expected(
     data: Transitions, features: FloatArray, model: KernelEmbedding | SampleModel, name: Any
 ) -> FloatArray:
-    """As `reps.update` computes it."""
-    origin = reps.embedding_origin(data, features, settings_of("observed", model=name))
+    """Expected features of the successors, with the given hyper-parameters."""
+    origin = embedding_origin(features[data.state], name)
     return origin + model.expected_features(successor_features(data, features) - origin)
 
 
 @pytest.fixture
 def data() -> Transitions:
-    return some_transitions(np.random.default_rng(7))
+    return Transitions.from_rollouts(random_walks(np.random.default_rng(7)))
 
 
 @pytest.fixture
 def features(data: Transitions) -> FloatArray:
     kernel = state_kernel(data, TASK, np.random.default_rng(8))
-    return reps.value_basis(data, kernel, Settings())[1]
+    return RKHSBasis.fit(kernel, data.points, tolerance=1e-6, max_rank=400)[1]
 
 
-def test_changes_are_counted_from_the_state_and_the_paper_counts_from_zero(
+def test_the_change_is_relative_to_the_state_and_the_embedding_to_zero(
     data: Transitions, features: FloatArray
 ) -> None:
-    own = reps.embedding_origin(data, features, kreps.KREPS(TASK, recipe="observed").settings)
-    np.testing.assert_array_equal(own, features[data.state])
-    zero = reps.embedding_origin(data, features, kreps.KREPS(TASK, recipe="paper").settings)
-    np.testing.assert_array_equal(zero, np.zeros_like(own))
+    own = features[data.state]
+    assert kreps.KREPS(TASK, preset="single_step").settings.model == "change"
+    np.testing.assert_array_equal(embedding_origin(own, "change"), own)
+    assert kreps.KREPS(TASK, preset="paper").settings.model == "embedding"
+    np.testing.assert_array_equal(embedding_origin(own, "embedding"), np.zeros_like(own))
+
+
+@pytest.mark.parametrize("low_rank", [None, kreps.LowRank(above=0)], ids=["exact", "low rank"])
+@pytest.mark.parametrize("name", ["change", "embedding"])
+def test_an_update_predicts_as_the_embedding_with_its_hyperparameters(
+    data: Transitions, name: Any, low_rank: kreps.LowRank | None
+) -> None:
+    settings = settings_of("single_step", model=name, low_rank=low_rank)
+    state, rng = LearnerState(ReplayWindow(TASK, None)), np.random.default_rng(8)
+    batch = batch_of(state, random_walks(np.random.default_rng(7)), settings, rng, Compute())
+    kernel = state_kernel(batch.data, TASK, rng)
+    found = batch.value_features(kernel)
+    model = batch.transition_model(found, kernel, None, rng)
+    features = found.basis.features(data.points)
+    assert model.parameters is not None
+    inputs = np.concatenate([data.states, TASK.scaled_applied(data.actions)], axis=1)
+    lengthscales, regulariser = np.exp(model.parameters[:-1]), np.exp(model.parameters[-1])
+    whole = Kernel(factors_of(3), lengthscales)
+    embedding = KernelEmbedding.fit(whole, inputs, float(regulariser))
+    wanted = expected(data, features, embedding, name)
+    np.testing.assert_allclose(model.expected, wanted, atol=1e-3)
 
 
 def test_where_the_features_of_states_are_zero_the_change_is_eq_4(
     data: Transitions, features: FloatArray
 ) -> None:
-    # each state is a state and a successor; here only ends of roll-outs have any features
+    # only the last points of rollouts, which are no states, have features here
     only_last = np.zeros_like(features)
     last = np.setdiff1d(data.successor, data.state)
     only_last[last] = features[last]
@@ -335,7 +361,9 @@ def test_where_the_features_of_states_are_zero_the_change_is_eq_4(
     assert np.abs(found).max() > 0.01
 
 
-def test_the_change_is_the_sum_that_the_pages_have(data: Transitions, features: FloatArray) -> None:
+def test_the_change_is_the_sum_of_the_documentation(
+    data: Transitions, features: FloatArray
+) -> None:
     model = embedding_of(data, 0.1)
     own, after = features[data.state], features[data.successor]
     wanted = own + model.strengths(model.inputs).T @ (after - own)
@@ -357,7 +385,9 @@ def test_without_regularisation_it_is_the_sample_model(
     assert off[2] < 1e-5
 
 
-def test_far_from_the_data_the_state_stays(data: Transitions, features: FloatArray) -> None:
+def test_far_from_the_data_the_predicted_change_is_zero(
+    data: Transitions, features: FloatArray
+) -> None:
     model = embedding_of(data, 0.1)
     strengths = model.strengths(np.array([[50.0, 50.0, 0.0]]))[:, 0]
     changes = features[data.successor] - features[data.state]
@@ -366,8 +396,8 @@ def test_far_from_the_data_the_state_stays(data: Transitions, features: FloatArr
     np.testing.assert_array_equal(own + strengths @ changes, own)
 
 
-def test_a_sample_without_neighbours_keeps_a_share_of_its_change() -> None:
-    data = some_transitions(np.random.default_rng(9), far=50.0)
+def test_an_isolated_sample_keeps_a_share_of_its_change() -> None:
+    data = Transitions.from_rollouts(random_walks(np.random.default_rng(9), far=50.0))
     steps = len(data) // 3
     kept = 2 * steps + 1
     alone = replace(
@@ -397,7 +427,7 @@ def test_the_sample_model_does_not_depend_on_the_origin(
         np.testing.assert_allclose(found, observed, atol=1e-15 * (1.0 + np.abs(features).max()))
 
 
-def test_after_a_real_end_the_change_leads_to_the_start_states(
+def test_after_a_termination_the_change_leads_to_the_start_states(
     data: Transitions, features: FloatArray
 ) -> None:
     ended = replace(data, terminated=np.arange(len(data)) % 10 == 9)

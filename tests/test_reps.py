@@ -7,40 +7,29 @@ from typing import Any
 
 import numpy as np
 import pytest
-import scipy.optimize
 
-from kreps.algorithms import reps
-from kreps.algorithms.acceptance import ETA_FLOOR_WITHOUT_ACCEPTANCE_TEST
 from kreps.algorithms.dual import DualProblem, Outcome, kl_from_uniform
+from kreps.algorithms.exact import ExactBatch
 from kreps.algorithms.newton import KL_TOLERANCE, solve_dual
-from kreps.algorithms.reps import (
-    MIN_RELATIVE_WEIGHT,
-    LearnerState,
-    PolicyTargets,
-    UpdateInfo,
-    policy_hyperparameters,
-    update,
-)
+from kreps.algorithms.report import UpdateInfo
+from kreps.algorithms.reps import reps_step
+from kreps.algorithms.state import LearnerState, Stopwatch
+from kreps.algorithms.update import update
+from kreps.data.compute import Compute
 from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.errors import DataError
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.hyperparameters import (
-    LOSS_TOLERANCE,
-    PolicyLoss,
-    Prior,
-    factor_distances,
-    minimise,
-)
 from kreps.kernels.kernel import Kernel, factors_of
-from kreps.models import transition as transition_model
 from kreps.models.transition import feature_differences, restart_features, successor_features
-from kreps.settings import Settings, settings_of
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
+from kreps.presets import settings_of
+from kreps.settings import RKHS, Grid, Settings
 
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
-SINGLE_STEP = settings_of("observed")
-"""One step on the actions that were taken: what most of these tests are about."""
+SINGLE_STEP = settings_of("single_step")
+"""One step on the sampled actions, without generated ones."""
 
 
 def collect(
@@ -66,8 +55,8 @@ def collect(
     return found
 
 
-def fresh(capacity: int = 30) -> LearnerState:
-    return LearnerState(ReplayWindow(capacity))
+def new_state(capacity: int = 30, task: TaskSpec = TASK) -> LearnerState:
+    return LearnerState(ReplayWindow(task, capacity))
 
 
 def run(
@@ -78,11 +67,11 @@ def run(
     task: TaskSpec = TASK,
 ) -> tuple[LearnerState, UpdateInfo]:
     return update(
-        fresh() if state is None else state,
+        new_state(task=task) if state is None else state,
         rollouts,
-        task,
         SINGLE_STEP if settings is None else settings,
         np.random.default_rng(seed),
+        Compute(),
     )
 
 
@@ -115,13 +104,13 @@ def assert_bounded(info: UpdateInfo, settings: Settings) -> None:
     """KL is at its bound, or below it with the temperature at its floor."""
     dual = info.dual
     assert dual.converged
-    sample = max(settings.from_generated, 1) * info.samples
-    from_model_rollouts = round(
-        settings.imagined_rollouts * sample
-    )  # these come last, where states can be led to
-    assert len(dual.weights) in (
-        (sample, from_model_rollouts) if settings.from_generated else (sample,)
-    )
+    weights = info.samples
+    if settings.model_based is not None:
+        weights *= settings.model_based.actions_per_state
+        if settings.model == "dynamics" and info.samples >= 40:
+            # the last step is in states of model rollouts
+            weights = round(settings.model_based.model_rollout_fraction * weights)
+    assert len(dual.weights) == weights
     assert dual.weights.sum() == pytest.approx(1.0, abs=1e-12)
     assert (dual.weights >= 0.0).all()
     kl = kl_from_uniform(dual.weights)
@@ -133,26 +122,29 @@ def assert_bounded(info: UpdateInfo, settings: Settings) -> None:
 
 
 @pytest.mark.parametrize(
-    ("recipe", "model"),
+    ("preset", "model"),
     [
-        ("default", "change"),
-        ("default", "embedding"),
-        *[(recipe, model) for recipe in ("observed", "paper") for model in ("embedding", "sample")],
+        ("model_based", "change"),
+        ("model_based", "embedding"),
+        ("single_step", "embedding"),
+        ("single_step", "sample"),
+        ("paper", "embedding"),
+        ("paper", "sample"),
     ],
 )
-def test_the_weights_move_as_far_as_the_bound_or_the_floor_permits(recipe: str, model: str) -> None:
-    settings = settings_of(recipe, model=model)
+def test_the_kl_of_the_weights_is_at_its_bound_or_eta_at_its_floor(preset: str, model: str) -> None:
+    settings = settings_of(preset, model=model)
     _, info = run(collect(), settings)
     assert_bounded(info, settings)
     assert info.samples == 150
     assert info.effective_samples == pytest.approx(1.0 / np.sum(info.dual.weights**2))
     assert info.effective_samples < 140.0 / 150.0 * len(info.dual.weights)
-    assert info.rank_residual <= settings.basis_tolerance
+    assert info.rank_residual <= 1e-6
     assert (info.embedding_parameters is None) == (model == "sample")
 
 
-def test_fixed_features_are_a_grid_over_all_states() -> None:
-    settings = settings_of("observed", features="grid", grid_size=6)
+def test_grid_features_are_centred_over_all_states() -> None:
+    settings = settings_of("single_step", value=Grid(6))
     rollouts = collect()
     state, info = run(rollouts, settings)
     assert_bounded(info, settings)
@@ -164,34 +156,36 @@ def test_fixed_features_are_a_grid_over_all_states() -> None:
     np.testing.assert_allclose(state.value.centres.max(axis=0), points.max(axis=0))
 
 
-def test_a_high_floor_keeps_the_update_short_of_the_bound() -> None:
-    settings = settings_of("observed", kl_bound=3.0, eta_floor=2.0)
+def test_at_a_high_floor_the_kl_stays_below_its_bound() -> None:
+    settings = settings_of("single_step", kl_bound=3.0, eta_floor=2.0)
     _, info = run(collect(), settings)
     assert info.dual.outcome is Outcome.AT_FLOOR
     assert info.dual.eta == 2.0
     assert 0.0 < info.dual.kl < 2.0
 
 
-@pytest.mark.parametrize("features", ["rkhs", "grid"])
+@pytest.mark.parametrize("value", [RKHS(angle_wrap="continuous"), Grid()], ids=["rkhs", "grid"])
 @pytest.mark.parametrize("model", ["embedding", "sample"])
-def test_the_weights_are_the_exponentials_of_the_bellman_errors(model: str, features: str) -> None:
+def test_the_weights_are_the_exponentials_of_the_bellman_errors(
+    model: str, value: RKHS | Grid
+) -> None:
     """Eqs. 1, 4 and 5 put together from the learnt V and hyper-parameters, in plain NumPy."""
     restart = 0.07
     rollouts = collect(steps=12) + collect(4, 5, seed=1, terminated=True)
-    settings = settings_of("observed", model=model, features=features, restart_probability=restart)
+    settings = settings_of("single_step", model=model, value=value, restart_probability=restart)
     state, info = run(rollouts, settings)
-    value = state.value
-    assert value is not None
+    v = state.value
+    assert v is not None
 
     states = np.concatenate([r.observations[:-1] for r in rollouts])
     rewards = np.concatenate([r.rewards for r in rollouts])
-    at_start = np.mean([value(r.observations[:1])[0] for r in rollouts])
+    at_start = np.mean([v(r.observations[:1])[0] for r in rollouts])
     after = []
     for r in rollouts:
-        v = value(r.observations[1:])
+        successors = v(r.observations[1:])
         if r.terminated:
-            v[-1] = at_start
-        after.append(v)
+            successors[-1] = at_start
+        after.append(successors)
     expected = np.concatenate(after)
     if model == "embedding":
         assert info.embedding_parameters is not None
@@ -201,18 +195,18 @@ def test_the_weights_are_the_exponentials_of_the_bellman_errors(model: str, feat
         gram = np.exp(-0.5 * squares)
         noise = info.embedding_parameters[-1] * np.eye(len(gram))
         expected = gram @ np.linalg.solve(gram + noise, expected)
-    delta = rewards + (1.0 - restart) * expected + restart * at_start - value(states)
+    delta = rewards + (1.0 - restart) * expected + restart * at_start - v(states)
     wanted = np.exp((delta - delta.max()) / (info.dual.eta * rewards.std()))
     wanted /= wanted.sum()
     assert np.abs(info.dual.weights - wanted).sum() < 1e-5
 
 
-def test_the_policy_is_the_weighted_process_of_the_commanded_actions() -> None:
+def test_the_policy_is_the_weighted_gaussian_process_of_the_commanded_actions() -> None:
     rollouts = collect()
     state, info = run(rollouts)
     assert state.policy is not None
     p = info.dual.weights
-    kept = 150 * p >= MIN_RELATIVE_WEIGHT
+    kept = 150 * p >= 0.05
     assert 0 < kept.sum() < 150
     assert info.support == kept.sum()
     weights = p[kept] / np.sum(p**2)
@@ -233,66 +227,39 @@ def test_the_policy_is_the_weighted_process_of_the_commanded_actions() -> None:
     )
 
 
-def test_fits_start_where_those_of_the_last_update_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    starts: list[FloatArray] = []
+class RecordingBatch(ExactBatch):
+    """Records the start points of the fits, and ends each at a given point."""
 
-    def spy(loss: Any, prior: Prior, *given: FloatArray) -> FloatArray:
-        starts.append(given[0])
-        return minimise(loss, prior, *given)
+    def __init__(self, state: LearnerState, rollouts: list[Rollout]) -> None:
+        super().__init__(state.append(rollouts), rollouts, SINGLE_STEP, Stopwatch())
+        self.starts: list[FloatArray | None] = []
 
-    for module in (reps, transition_model):
-        monkeypatch.setattr(module, "minimise", spy)
-    first, _ = run(collect(seed=1))
-    second, _ = run(collect(seed=2), state=first)
-    assert len(starts) == 4  # embedding and policy, twice
-    assert first.embedding_start is not None
-    assert first.policy_start is not None
-    np.testing.assert_array_equal(starts[2], first.embedding_start)
-    np.testing.assert_array_equal(starts[3], first.policy_start)
-    assert second.embedding_start is not None
-    assert not np.array_equal(second.embedding_start, first.embedding_start)
+    def transition_model(self, features: Any, kernel: Any, start: Any, rng: Any) -> Any:
+        self.starts.append(start)
+        return super().transition_model(features, kernel, start, rng)
+
+    def fit_policy(self, targets: Any, kernel: Any, start: Any, *others: Any) -> Any:
+        self.starts.append(start)
+        return super().fit_policy(targets, kernel, start, *others)
 
 
-def test_policy_hyperparameters_are_the_most_probable_ones() -> None:
-    """Leave-one-out loss plus ``1/2 sum ((x - c) / sd)^2 / sum w``, minimised afresh by BFGS."""
-    rng = np.random.default_rng(13)
-    states, targets = rng.normal(size=(25, 2)), rng.normal(0.0, 0.8, size=(25, 1))
-    weights = rng.uniform(0.2, 2.0, 25)
-    samples = PolicyTargets(states, targets, weights, float(weights.sum()), np.zeros(25))
-    kernel = Kernel(factors_of(2), np.array([0.9, 1.4]))
-    found = policy_hyperparameters(samples, kernel, settings_of(), None, rng)
-
-    share = samples.weights / samples.weights.sum()
-    log_variance = np.log(share @ (targets[:, 0] - share @ targets[:, 0]) ** 2)
-    centre = np.append(np.log([0.9, 1.4]) - 0.5, [log_variance - 0.3, log_variance - 1.0])
-    spread = np.array([0.7, 0.7, 1.0, 1.0])
-    loss = PolicyLoss(factor_distances(kernel.factors, states), targets, samples.weights)
-
-    def objective(x: FloatArray) -> float:
-        penalty = 0.5 * np.sum(((x - centre) / spread) ** 2) / samples.weights.sum()
-        return float(loss(x)[0] + penalty)
-
-    best = scipy.optimize.minimize(objective, centre, method="BFGS", options={"gtol": 1e-6})
-    np.testing.assert_allclose(found, best.x, atol=0.05)
-    assert objective(found) == pytest.approx(best.fun, abs=LOSS_TOLERANCE)
+def test_fits_start_where_those_of_the_last_update_ended() -> None:
+    state, _ = run(collect(seed=1))
+    assert state.embedding_start is not None
+    assert state.policy_start is not None
+    batch = RecordingBatch(state, collect(seed=2))
+    step = reps_step(batch, state, 0.1, np.random.default_rng(0))
+    embedding_start, policy_start = batch.starts
+    assert embedding_start is state.embedding_start
+    assert policy_start is state.policy_start
+    after, _ = run(collect(seed=2), state=state)
+    assert after.embedding_start is not None and step.model.parameters is not None
+    np.testing.assert_array_equal(after.embedding_start, step.model.parameters)
+    np.testing.assert_array_equal(after.policy_start, step.policy.x)
+    assert not np.array_equal(after.embedding_start, state.embedding_start)
 
 
-def test_bounded_policy_hyperparameters_keep_to_their_ranges() -> None:
-    rng = np.random.default_rng(14)
-    kernel = Kernel(factors_of(2), np.array([0.9, 1.4]))
-    states = rng.normal(size=(40, 2))
-    low = np.log([0.3 * 0.9, 0.3 * 1.4, 0.01, 1e-4])
-    high = np.log([0.9, 1.4, 3.0, 4.0])
-    # Pure noise asks for a long lengthscale, targets all zero for no variance.
-    for targets in (rng.normal(size=(40, 1)), np.zeros((40, 1)), 100.0 * states[:, :1]):
-        samples = PolicyTargets(states, targets, np.ones(40), 40.0, np.zeros(40))
-        found = policy_hyperparameters(samples, kernel, settings_of("paper"), None, rng)
-        assert (found >= low - 1e-12).all()
-        assert (found <= high + 1e-12).all()
-        assert (np.minimum(found - low, high - found) < 1e-6).any()
-
-
-def test_the_new_policy_pushes_towards_the_reward() -> None:
+def test_the_new_policy_pushes_towards_the_origin() -> None:
     state, _ = run(collect(20, 15, seed=5))
     assert state.policy is not None
     left, right = state.policy.mean(np.array([[-1.0, 0.0], [1.0, 0.0]]))[:, 0]
@@ -300,10 +267,10 @@ def test_the_new_policy_pushes_towards_the_reward() -> None:
     assert right < -0.1
 
 
-def test_one_seed_gives_one_policy_to_the_last_byte() -> None:
+def test_one_seed_gives_one_policy_byte_for_byte() -> None:
     # More than 500 points and 300 samples, so that every random choice is really made.
     rollouts = collect(36, 15)
-    state = fresh(40)
+    state = new_state(40)
     first, second, other = (run(rollouts, state=state, seed=seed)[0] for seed in (7, 7, 8))
     assert fingerprint(first) == fingerprint(second)
     assert fingerprint(first) != fingerprint(other)
@@ -325,43 +292,41 @@ def test_the_old_state_is_not_modified() -> None:
 
 def test_forgotten_rollouts_are_counted_but_not_learnt_from() -> None:
     old, new = collect(6, seed=1), collect(6, 10, seed=2)
-    sample = settings_of("observed", model="sample")
-    first, _ = run(old, sample, fresh(6))
+    sample = settings_of("single_step", model="sample")
+    first, _ = run(old, sample, new_state(6))
     second, info = run(new, sample, replace(first, policy_start=None))
-    alone, _ = run(new, sample, fresh(6))
+    alone, _ = run(new, sample, new_state(6))
     assert info.samples == 60
     assert (second.rollouts, second.steps) == (12, 6 * 15 + 6 * 10)
     assert fingerprint(second) == fingerprint(alone)
 
 
-def test_no_new_rollouts_are_learnt_from_when_old_ones_are_kept() -> None:
+def test_an_update_without_new_rollouts_uses_those_of_the_window() -> None:
     first, _ = run(collect(5))
     second, info = run([], state=first)
     assert info.samples == 75
     assert (second.iteration, second.rollouts, second.steps) == (2, 5, 75)
 
 
-def test_nothing_to_learn_from_is_refused() -> None:
+def test_an_update_without_any_rollout_is_an_error() -> None:
     with pytest.raises(DataError):
         run([])
 
 
 @pytest.mark.parametrize(("ds", "da"), [(3, 1), (1, 1), (2, 2)])
-def test_rollouts_of_another_width_are_refused(ds: int, da: int) -> None:
+def test_rollouts_of_another_width_are_an_error(ds: int, da: int) -> None:
     stranger = Rollout(np.zeros((4, ds)), np.zeros((3, da)), np.zeros(3))
-    state = fresh()
+    state = new_state()
     with pytest.raises(DataError):
         run([*collect(2), stranger], state=state)
-    assert state.window.rollouts == ()
+    assert len(state.window.rollouts) == 0
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1e8])
-@pytest.mark.parametrize("recipe", ["default", "observed", "paper"])
-def test_the_unit_of_the_reward_changes_nothing_but_the_unit_of_v(
-    recipe: str, scale: float
-) -> None:
+@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper"])
+def test_v_scales_with_the_reward_and_the_weights_do_not(preset: str, scale: float) -> None:
     rollouts = collect()
-    settings = settings_of(recipe)
+    settings = settings_of(preset)
     state, info = run(rollouts, settings)
     scaled_state, scaled = run(with_rewards(rollouts, lambda r: scale * r), settings)
     np.testing.assert_allclose(scaled.dual.weights, info.dual.weights, atol=1e-6)
@@ -379,13 +344,13 @@ def test_a_constant_added_to_the_reward_changes_nothing() -> None:
     np.testing.assert_allclose(moved.dual.weights, info.dual.weights, atol=1e-8)
 
 
-@pytest.mark.parametrize("recipe", ["default", "observed", "paper"])
-def test_equal_rewards_are_learnt_from_without_harm(recipe: str) -> None:
-    settings = settings_of(recipe)
+@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper"])
+def test_equal_rewards_give_a_usable_policy(preset: str) -> None:
+    settings = settings_of(preset)
     state, info = run(with_rewards(collect(), lambda r: np.full_like(r, -3.0)), settings)
-    assert_bounded(info, replace(settings, from_generated=0))  # there is nothing to gain by it
-    if recipe == "default":  # and nothing is judged, so the step is as careful as where it cannot
-        assert (info.rejected, info.eta_floor) == (None, ETA_FLOOR_WITHOUT_ACCEPTANCE_TEST)
+    assert_bounded(info, replace(settings, model_based=None))  # no sample is generated
+    if preset == "model_based":  # and the floor is that without an acceptance test
+        assert (info.rejected, info.eta_floor) == (None, 0.05)
     assert_usable(state)
 
 
@@ -399,9 +364,9 @@ def assert_usable(state: LearnerState, task: TaskSpec = TASK) -> None:
 
 
 @pytest.mark.parametrize("model", ["embedding", "sample"])
-def test_duplicated_states_are_served(model: str) -> None:
+def test_duplicated_samples_share_their_weight(model: str) -> None:
     rollouts = collect(4, 10)
-    settings = settings_of("observed", model=model)
+    settings = settings_of("single_step", model=model)
     state, info = run(rollouts * 3, settings)
     assert_bounded(info, settings)
     assert_usable(state)
@@ -411,30 +376,31 @@ def test_duplicated_states_are_served(model: str) -> None:
     np.testing.assert_allclose(weights[1:], weights[:1].repeat(2, axis=0), atol=1e-9)
 
 
-@pytest.mark.parametrize("recipe", ["default", "observed"])
-def test_a_single_distinct_state_is_served(recipe: str) -> None:
+@pytest.mark.parametrize("preset", ["model_based", "single_step"])
+def test_a_single_distinct_state_gives_a_usable_policy(preset: str) -> None:
     rng = np.random.default_rng(6)
     still = [
         Rollout(np.full((6, 2), 0.3), rng.normal(size=(5, 1)), rng.normal(size=5)) for _ in range(4)
     ]
-    settings = settings_of(recipe)
+    settings = settings_of(preset)
     state, info = run(still, settings)
     assert info.rank == 1
     assert_bounded(info, settings)
     assert_usable(state)
 
 
-@pytest.mark.parametrize("recipe", ["default", "observed", "paper"])
-def test_a_single_distinct_action_is_served(recipe: str) -> None:
+@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper"])
+def test_a_single_distinct_action_is_learnt(preset: str) -> None:
     same = [replace(r, actions=np.full_like(r.actions, 0.5)) for r in collect()]
-    hopeful = settings_of(recipe)
-    state, info = run(same, hopeful)
-    assert_bounded(info, hopeful)
-    assert_usable(state)
-    settings = replace(hopeful, optimism=0.0)  # no other action is hoped for
+    settings = settings_of(preset)
     state, info = run(same, settings)
-    assert state.policy is not None
-    if settings.from_generated:
+    assert_bounded(info, settings)
+    assert_usable(state)
+    if settings.model_based is not None:  # without the bonus of unexplored actions
+        settings = settings_of(settings, **{"model_based.exploration_bonus": 0.0})
+    state, info = run(same, settings)
+    assert isinstance(state.policy, CostSensitiveGP)
+    if settings.model_based is not None:
         weights = state.policy.weights / state.policy.weights.sum()
         near = state.policy.states[weights > 0.01]
     else:
@@ -442,32 +408,32 @@ def test_a_single_distinct_action_is_served(recipe: str) -> None:
     np.testing.assert_allclose(state.policy.mean(near), 0.5, atol=0.1)
 
 
-@pytest.mark.parametrize("recipe", ["default", "observed", "paper"])
-def test_a_single_step_is_served(recipe: str) -> None:
+@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper"])
+def test_a_single_step_gives_a_usable_policy(preset: str) -> None:
     one = [Rollout(np.array([[0.0, 0.0], [0.1, 0.3]]), np.array([[1.0]]), np.array([-1.0]))]
-    settings = settings_of(recipe)
+    settings = settings_of(preset)
     state, info = run(one, settings)
-    np.testing.assert_array_equal(info.dual.weights, [1.0])  # nothing tells of the states
+    np.testing.assert_array_equal(info.dual.weights, [1.0])  # no reward depends on the state
     assert info.dual.outcome is Outcome.AT_FLOOR
     assert info.support == 1
     assert_usable(state)
 
 
-@pytest.mark.parametrize("recipe", ["default", "observed"])
-def test_rewards_with_one_enormous_outlier_are_served(recipe: str) -> None:
+@pytest.mark.parametrize("preset", ["model_based", "single_step"])
+def test_one_enormous_negative_reward_has_no_weight(preset: str) -> None:
     rollouts = collect()
     spoilt = np.array(rollouts[0].rewards)
     spoilt[3] = -1e9
     rollouts[0] = replace(rollouts[0], rewards=spoilt)
-    settings = settings_of(recipe)
+    settings = settings_of(preset)
     state, info = run(rollouts, settings)
     assert_bounded(info, settings)
-    if not settings.from_generated:
+    if settings.model_based is None:
         assert info.dual.weights[3] < 1e-6
     assert_usable(state)
 
 
-def test_a_periodic_coordinate_is_learnt_as_one() -> None:
+def test_policy_and_value_are_periodic_in_an_angle() -> None:
     task = replace(TASK, periodic=(0,))
     state, _ = run(collect(), task=task)
     assert state.policy is not None
@@ -478,15 +444,15 @@ def test_a_periodic_coordinate_is_learnt_as_one() -> None:
     np.testing.assert_allclose(state.value(turned), state.value(query), atol=1e-6)
 
 
-@pytest.mark.parametrize("recipe", ["default", "observed"])
-def test_several_actions_of_unequal_scale_are_served(recipe: str) -> None:
+@pytest.mark.parametrize("preset", ["model_based", "single_step"])
+def test_several_actions_of_different_scale_are_learnt(preset: str) -> None:
     rng = np.random.default_rng(10)
     task = TaskSpec(2, np.array([-2.0, 0.0]), np.array([2.0, 1000.0]))
     rollouts = [
         replace(r, actions=np.column_stack([r.actions, rng.uniform(0, 1000, len(r))]))
         for r in collect()
     ]
-    settings = settings_of(recipe)
+    settings = settings_of(preset)
     state, info = run(rollouts, settings, task=task)
     assert_bounded(info, settings)
     assert state.policy is not None
@@ -509,7 +475,7 @@ def test_successor_features_are_those_of_the_next_point() -> None:
     np.testing.assert_array_equal(successor_features(data, features), features[data.state + 1])
 
 
-def test_after_an_end_the_successor_is_the_mean_start() -> None:
+def test_after_a_termination_the_successor_features_are_those_of_the_mean_start() -> None:
     data, features = transitions(terminated=True)
     before = features.copy()
     found = successor_features(data, features)
@@ -533,24 +499,22 @@ def test_the_restart_mixes_the_expectation_with_the_mean_start(restart: float) -
         np.testing.assert_allclose(row, wanted, atol=1e-14)
 
 
-def test_a_share_of_the_restarts_is_in_the_sampled_states() -> None:
+def test_a_share_of_the_restart_features_is_of_sampled_states() -> None:
     starts, states = np.array([1.0, 0.0]), np.array([0.0, 4.0])
     for share, wanted in [(0.0, [1.0, 0.0]), (0.25, [0.75, 1.0]), (1.0, [0.0, 4.0])]:
-        found = restart_features(starts, states, Settings(exploring_starts=share))
+        found = restart_features(starts, states, share)
         np.testing.assert_array_equal(found, wanted)
 
 
-def test_exploring_starts_give_weight_to_the_best_action_beside_the_way() -> None:
-    """Two states: to stay in the first pays, and only from there may the second be reached."""
+def test_exploring_starts_give_weight_to_the_best_action_off_the_path() -> None:
+    """Two states: staying in the first is best, and the second is reached only from there."""
     eye = np.eye(2)
     state, after = np.array([0, 0, 1, 1]), np.array([0, 1, 0, 1])
     stay, leave, back, remain = range(4)
     rewards = np.array([0.0, -1.0, -1.0, -1.0])
     found = {}
     for share in (0.0, 0.25):
-        restart = restart_features(
-            eye[0], eye[state].mean(axis=0), Settings(exploring_starts=share)
-        )
+        restart = restart_features(eye[0], eye[state].mean(axis=0), share)
         differences = feature_differences(eye[state], eye[after], restart, 0.1)
         problem = DualProblem(rewards, differences, kl_bound=2.0, ridge=1e-6, eta_floor=0.05)
         found[share] = solve_dual(problem).weights
@@ -558,21 +522,6 @@ def test_exploring_starts_give_weight_to_the_best_action_beside_the_way() -> Non
         assert p[stay] > 0.9
         assert p[leave] < 1e-3
     assert found[0.0][[back, remain]].sum() < 1e-4
-    concat = 0.1 * 0.25 * 0.5  # restarts there, and it is left at once
-    assert found[0.25][back] == pytest.approx(concat, rel=0.1)
+    second = 0.1 * 0.25 * 0.5  # restarts there, and leaves at once
+    assert found[0.25][back] == pytest.approx(second, rel=0.1)
     assert found[0.25][remain] < 0.1 * found[0.25][back]
-
-
-def test_policy_samples_drop_what_weighs_next_to_nothing() -> None:
-    data, _ = transitions(terminated=False)
-    task = TaskSpec(2, np.array([1.0]), np.array([5.0]))
-    n = len(data)
-    p = np.full(n, 1.0)
-    p[[1, 4]] = 1e-4
-    p /= p.sum()
-    found = PolicyTargets.of(data, p, task)
-    kept = np.setdiff1d(np.arange(n), [1, 4])
-    np.testing.assert_array_equal(found.states, data.states[kept])
-    np.testing.assert_allclose(found.targets, (data.actions[kept] - 3.0) / 2.0)
-    np.testing.assert_allclose(found.weights, p[kept] / np.sum(p**2))
-    assert found.weights.sum() == pytest.approx(1.0 / np.sum(p**2), rel=1e-3)

@@ -24,6 +24,7 @@ from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis
 from kreps.kernels.kernel import Kernel
 from kreps.models.dynamics import expected_features_of_samples, fit_dynamics
 from kreps.models.transition import (
+    embedding_origin,
     feature_differences,
     fit_embedding,
     fit_regression,
@@ -109,13 +110,9 @@ class ExactBatch:
         start: FloatArray | None,
         rng: np.random.Generator,
     ) -> Expectation:
-        """Eq. 4 on the features of successors, as printed or less those of the state itself.
-
-        An embedding fades to its origin far from the data.  That the state stays is a better guess
-        there than that its features vanish.
-        """
+        """Eq. 4 on the features of successors, as printed or less those of the state."""
         data, model = self.data, self.settings.model
-        origin = np.zeros_like(features.own) if model == "embedding" else features.own
+        origin = embedding_origin(features.own, model)
         observed = np.where(data.terminated[:, None], features.start, features.observed)
         targets = observed - origin
         if model == "sample":

@@ -55,6 +55,7 @@ from kreps.models.dynamics import (
 )
 from kreps.models.transition import (
     embedding_hyperparameters,
+    embedding_origin,
     feature_differences,
     restart_features,
     state_actions,
@@ -97,6 +98,7 @@ class LowRankBatch:
         clock: of the update.
         compute: workers and device.
         rng: draws the subsample.
+        tolerance: largest squared residual in the bases of state-actions and of the policy.
 
     Raises:
         DataError: a chunk with observations or actions of another width than the task's.
@@ -111,9 +113,10 @@ class LowRankBatch:
         clock: Stopwatch,
         compute: Compute,
         rng: np.random.Generator,
+        tolerance: float = RESIDUAL_TOLERANCE,
     ) -> None:
         self.window, self.task, self.settings, self.clock = window, window.task, settings, clock
-        self.low_rank, self.compute = low_rank, compute
+        self.low_rank, self.compute, self.tolerance = low_rank, compute, tolerance
         self.jitters: list[float] = []
         self.from_dataset = isinstance(samples, Dataset)
         if isinstance(samples, Dataset):
@@ -195,7 +198,7 @@ class LowRankBatch:
         start: FloatArray | None,
         rng: np.random.Generator,
     ) -> StreamedExpectation:
-        """Eq. 4 on the features of successors, as printed or less those of the state itself."""
+        """Eq. 4 on the features of successors, as printed or less those of the state."""
         data, task, own = self.data, self.task, features.own
         state_features = features.state_features
         terminated = data.terminated[:, None].astype(np.float64)
@@ -204,7 +207,7 @@ class LowRankBatch:
             successors = ObservedSuccessors(state_features)
             return StreamedExpectation(after, None, None, None, None, successors)
         relative = self.settings.model == "change"
-        origin = own if relative else np.zeros_like(own)
+        origin = embedding_origin(own, self.settings.model)
         model, errors, x = self._regressed(
             after - origin,
             lambda basis: EmbeddingSums(state_features, basis, task, relative),
@@ -352,7 +355,8 @@ class LowRankBatch:
         return self._centres(kernel.with_lengthscales(np.exp(x[:-2])), targets.states, rank)
 
     def _centres(
-        self, kernel: Kernel, points: FloatArray, rank: int, tolerance: float = RESIDUAL_TOLERANCE
+        self, kernel: Kernel, points: FloatArray, rank: int, tolerance: float | None = None
     ) -> RKHSBasis:
         """At most ``rank`` features of a kernel, whose centres are pivots among points (m, d)."""
+        tolerance = self.tolerance if tolerance is None else tolerance
         return RKHSBasis.fit(kernel, points, tolerance=tolerance, max_rank=rank)[0]

@@ -19,7 +19,8 @@ from kreps.kernels.arrays import FloatArray
 from kreps.models.model_env import ModelEnv, ModelRollouts
 
 DECAY = 0.35
-"""Factor of the bonus after each update: regions that stay unexplored were passed by."""
+"""Factor of the bonus after each update: a region that is still unexplored after some updates has
+not been visited despite its bonus."""
 
 MIN_STRENGTH = 0.005
 """A smaller bonus is left out."""
@@ -34,7 +35,7 @@ KNOWN_QUANTILE = 0.9
 MIN_RADIUS = 1e-12
 """Smallest novelty radius: states that are equal up to rounding are explored."""
 
-BLOCK = 3_000
+BLOCK_SIZE = 3_000
 """Samples compared with all others at once, which bounds the memory."""
 
 _TINY = float(np.finfo(np.float64).tiny)
@@ -116,19 +117,25 @@ def novelty_bonus(
     return NoveltyBonus(average + strength * max(best - average, 0.0), average, radius)
 
 
-def novelty_radius(model_env: ModelEnv) -> float | None:
+def novelty_radius(model_env: ModelEnv, block_size: int = BLOCK_SIZE) -> float | None:
     """Half the squared distance, in lengthscales, within which most samples have another rollout's.
 
-    Samples of the same rollout do not count, as they are near in any case.  None if all samples are
-    of one rollout.
+    Samples of the same rollout do not count, as they are near in any case.
+
+    Args:
+        model_env: of the samples.
+        block_size: samples compared with all others at once.
+
+    Returns:
+        None if all samples are of one rollout.
     """
     states, rollout = model_env.data.states, model_env.data.rollout
     if rollout[0] == rollout[-1]:
         return None
     nearest = []
-    for i in range(0, len(states), BLOCK):
-        similarity = model_env.kernel.gram(states[i : i + BLOCK], states)
-        similarity[rollout[i : i + BLOCK, None] == rollout] = 0.0
+    for i in range(0, len(states), block_size):
+        similarity = model_env.kernel.gram(states[i : i + block_size], states)
+        similarity[rollout[i : i + block_size, None] == rollout] = 0.0
         nearest.append(similarity.max(axis=1))
     at_radius = np.quantile(np.concatenate(nearest), 1.0 - KNOWN_QUANTILE)
     return max(-float(np.log(max(at_radius, _TINY))), MIN_RADIUS)

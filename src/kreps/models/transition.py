@@ -92,6 +92,19 @@ def successor_features(data: Transitions, features: FloatArray) -> FloatArray:
     return successors
 
 
+def embedding_origin(own: FloatArray, model: str) -> FloatArray:
+    """Features (n, r) that are subtracted from the targets of the embedding and added again.
+
+    Far from the data an embedding predicts zero.  Relative to the features of the state, this means
+    that the state stays, which is a better guess than that its features vanish.
+
+    Args:
+        own: (n, r) features of each state.
+        model: ``"embedding"`` has zeros, as printed (Eq. 4); other models have ``own``.
+    """
+    return np.zeros_like(own) if model == "embedding" else own
+
+
 def restart_features(starts: FloatArray, states: FloatArray, exploring_starts: float) -> FloatArray:
     """Mean features (r,) of the states in which the process restarts, as assumed by the update.
 
