@@ -171,9 +171,9 @@ def _draw_reward(axes: Axes, rows: Sequence[Row], references: Mapping[str, float
     found = reward_trend(rows)
     if found is not None:
         time = column(rows, "iteration")[-found.iterations :]
-        middle = values[-found.iterations :].mean()
-        ends = middle + found.rise * np.array([-0.5, 0.5])
-        axes.plot(time[[0, -1]], ends, color="#222222", lw=1.4)
+        line = found.rise * np.linspace(-0.5, 0.5, found.iterations)
+        line += np.median(values[-found.iterations :] - line)
+        axes.plot(time, line, color="#222222", lw=1.4)
     axes.margins(y=0.15)
 
 

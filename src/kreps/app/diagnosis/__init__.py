@@ -1,7 +1,7 @@
 """What limits a run, in words and with a remedy: from the rows of ``progress.csv`` to findings.
 
-One short function per cause.  Each compares the mean of the latest iterations, or the trend over
-the last half of them, with a threshold, and reports what is fine as well as what is not.  The
+One short function per cause.  Each compares the median of the latest iterations, or the trend
+over the last half of them, with a threshold, and reports what is fine as well as what is not.  The
 thresholds are in `thresholds`, their reasons in ``docs/diagnosis.md``.
 """
 

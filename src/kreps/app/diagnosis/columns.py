@@ -25,10 +25,20 @@ def latest(rows: Sequence[Row], name: str) -> float:
 
 
 def recent(rows: Sequence[Row], name: str) -> float:
-    """Mean over the latest iterations that have a value; NaN if none has."""
-    values = column(rows[-RECENT:], name)
-    known = values[np.isfinite(values)]
+    """Median over the latest iterations that have a value; NaN if none has."""
+    known = _recently_known(rows, name)
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+def recent_share(rows: Sequence[Row], name: str) -> float:
+    """Mean of a column of zeros and ones, over the same iterations as `recent`."""
+    known = _recently_known(rows, name)
     return float(known.mean()) if len(known) else float("nan")
+
+
+def _recently_known(rows: Sequence[Row], name: str) -> FloatArray:
+    values = column(rows[-RECENT:], name)
+    return values[np.isfinite(values)]
 
 
 def all_recorded(rows: Sequence[Row]) -> bool:
@@ -53,10 +63,25 @@ def policy_targets(rows: Sequence[Row]) -> FloatArray:
 
 
 def kl_share(rows: Sequence[Row]) -> float:
-    """Mean share of the KL bound that the updates used."""
-    return float(np.mean(column(rows, "kl") / column(rows, "kl_bound")))
+    """Share of the KL bound that the latest updates used: their median."""
+    late = rows[-RECENT:]
+    return float(np.median(column(late, "kl") / column(late, "kl_bound")))
+
+
+def learnt_rewards(rows: Sequence[Row]) -> FloatArray:
+    """Training rewards per step of the batches that learnt policies collected: (k,), k < m.
+
+    The first batch, and those after an update without a state-dependent reward, are of an
+    exploration policy, whose reward may be of any size.
+    """
+    learnt = ~(column(rows[:-1], "exploring") > 0.0)
+    return column(rows, "average_reward")[1:][learnt]
 
 
 def reward_range(rows: Sequence[Row]) -> float:
-    """Largest less smallest training reward per step so far."""
-    return float(np.ptp(column(rows, "average_reward")))
+    """Range of the training reward that learnt policies have covered, the worst and best left out.
+
+    No single batch can set it.  0 with fewer than four batches.
+    """
+    rewards = np.sort(learnt_rewards(rows))
+    return float(np.ptp(rewards[1:-1])) if len(rewards) >= 4 else 0.0

@@ -16,7 +16,7 @@ from kreps.app.diagnosis.thresholds import (
     MIN_POLICY_STD,
     NOISE_COST_NOTE,
 )
-from kreps.app.diagnosis.trend import reward_rises
+from kreps.app.diagnosis.trend import reward_course
 
 
 def exploration_noise(rows: Sequence[Row], evaluation: Mapping[str, Any] | None) -> Finding | None:
@@ -31,7 +31,7 @@ def exploration_noise(rows: Sequence[Row], evaluation: Mapping[str, Any] | None)
     if std < MIN_POLICY_STD:
         return Finding(
             name,
-            "note" if reward_rises(rows) else "limit",
+            "note" if reward_course(rows) == "rises" else "limit",
             std,
             MIN_POLICY_STD,
             f"{measured}, too small to try other actions.",
@@ -52,19 +52,18 @@ def exploration_noise(rows: Sequence[Row], evaluation: Mapping[str, Any] | None)
         return Finding(name, "fine", std, MAX_POLICY_STD, f"{measured}.")
     cost = evaluation["greedy"]["mean"] - evaluation["stochastic"]["mean"]
     limit = NOISE_COST_NOTE * reward_range(rows)
+    measured = f"{measured}; this noise costs {max(cost, 0.0):.3g} of reward per step"
     if cost > limit > 0.0:
         return Finding(
             name,
             "note",
             cost,
             limit,
-            f"{measured}; this noise costs {cost:.3g} of reward per step.",
+            f"{measured}.",
             "the greedy policy, predict(observation, deterministic=True); or more iterations, "
             "which reduce the noise.",
         )
-    return Finding(
-        name, "fine", std, MAX_POLICY_STD, f"{measured}; this noise costs little reward."
-    )
+    return Finding(name, "fine", std, MAX_POLICY_STD, f"{measured}.")
 
 
 def clipped_actions(rows: Sequence[Row]) -> Finding | None:

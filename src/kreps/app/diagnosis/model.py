@@ -29,12 +29,14 @@ def transition_model(rows: Sequence[Row]) -> Finding | None:
     if error < MODEL_ERROR_NOTE:
         return Finding(name, "fine", error, MODEL_ERROR_NOTE, f"{measured}.")
     found = trend(column(rows, "model_error"))
-    if found is not None and found.falls(MIN_MODEL_ERROR_FALL * error):
+    if found is None:
+        sentence, more = f"{measured}.", "more iterations or rollouts"
+    elif found.falls(MIN_MODEL_ERROR_FALL * error):
         sentence = f"{measured}, and it falls."
         more = "more iterations or rollouts, which reduce it further"
     else:
-        sentence = f"{measured}, and it does not fall."
-        more = f"more rollouts ({MORE_DATA})"
+        falls = "it hardly falls" if found.falls() else "it does not fall"
+        sentence, more = f"{measured}, and {falls}.", f"more rollouts ({MORE_DATA})"
     is_limit = error >= MODEL_ERROR_LIMIT
     return Finding(
         name,

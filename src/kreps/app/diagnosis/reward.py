@@ -7,17 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from kreps.app.diagnosis.columns import Row, column, kl_share, recent, reward_range
-from kreps.app.diagnosis.finding import Finding, counted
+from kreps.app.diagnosis.columns import Row, column, kl_share, recent
+from kreps.app.diagnosis.finding import Finding, Severity, counted
 from kreps.app.diagnosis.remedies import MORE_DATA, higher_floor
-from kreps.app.diagnosis.thresholds import (
-    LOW_KL_SHARE,
-    MAX_LEVEL_RISE,
-    MIN_ITERATIONS,
-    MIN_REWARD_RISE,
-    REFERENCE_TOLERANCE,
-)
-from kreps.app.diagnosis.trend import Trend, reward_rises, reward_trend
+from kreps.app.diagnosis.thresholds import LOW_KL_SHARE, MIN_ITERATIONS, REFERENCE_TOLERANCE
+from kreps.app.diagnosis.trend import Course, Trend, reward_course, reward_trend
 
 Evaluation = Mapping[str, Any]
 """Of ``evaluation.json``."""
@@ -58,18 +52,19 @@ def nearest_reference(references: Mapping[str, float], reward: float) -> tuple[s
 def local_optimum(
     rows: Sequence[Row], evaluation: Evaluation | None, references: Mapping[str, float]
 ) -> Finding | None:
-    """Whether the reward is near a known local optimum and does not rise."""
-    reward = best_estimate(rows, evaluation)
+    """Whether the reward stays near a known local optimum; None if not, or if that is unknown."""
+    reward, course = best_estimate(rows, evaluation), reward_course(rows)
     near = nearest_reference(references, reward)
-    if near is None or reward_rises(rows):
+    if near is None or course in ("unknown", "rises", "falls"):
         return None
     name, value = near
+    doing = "varies without a clear rise" if course == "varies" else course
     return Finding(
         "local optimum",
         "limit",
         reward,
         value,
-        f"The reward, {reward:.4g}, does not rise and is near a reference below "
+        f"The reward, {reward:.4g}, {doing} and is near a reference below "
         f"the best one: {name} ({value:g}).",
         "a new run with another --seed, more initial rollouts (--set initial_rollouts=60) or "
         "smaller steps (--set kl_bound=0.5). More iterations seldom help.",
@@ -80,11 +75,10 @@ def progress(
     rows: Sequence[Row], evaluation: Evaluation | None, references: Mapping[str, float]
 ) -> Finding:
     """Whether the training reward rises, falls or is level."""
-    name = "progress"
-    found = reward_trend(rows)
+    found, course = reward_trend(rows), reward_course(rows)
     if found is None:
         return Finding(
-            name,
+            "progress",
             "note",
             len(rows),
             MIN_ITERATIONS,
@@ -92,63 +86,53 @@ def progress(
             f"{MIN_ITERATIONS} are needed.",
             "more iterations (kreps resume RUN --iterations 20).",
         )
-    minimum = MIN_REWARD_RISE * reward_range(rows)
-    limit = max(found.error, minimum)
-    measured = f"{found.rise:+.3g} ± {found.error:.2g} over the last {found.iterations} iterations"
-    if found.falls(minimum):
-        return Finding(
-            name,
+    if course == "falls":
+        return _progress(
             "limit",
-            found.rise,
-            -limit,
-            f"The reward falls: {measured}.",
+            found,
+            f"The reward falls: {found}.",
             "smaller steps (--set kl_bound=0.3) with more rollouts for each (--set "
             "rollouts_per_iteration=20). Only the latest policy is stored; the same run with "
             "fewer iterations reproduces an earlier one.",
         )
-    if found.rises(minimum):
-        return Finding(name, "fine", found.rise, limit, f"The reward rises: {measured}.")
+    if course == "rises":
+        return _progress("fine", found, f"The reward rises: {found}.")
     reward, values = best_estimate(rows, evaluation), list(references.values())
     if values and values[0] - reward < REFERENCE_TOLERANCE * (values[0] - values[-1]):
-        return Finding(
-            name,
+        return _progress(
             "fine",
-            found.rise,
-            limit,
-            f"The reward does not rise ({measured}) and is near the best reference value "
-            f"({values[0]:g}).",
+            found,
+            f"The reward {course}, {found}, and is near the best reference value ({values[0]:g}).",
         )
-    return _level(rows, name, found, limit, measured)
+    return _level(rows, found, course)
 
 
-def _level(rows: Sequence[Row], name: str, found: Trend, limit: float, measured: str) -> Finding:
+def _level(rows: Sequence[Row], found: Trend, course: Course) -> Finding:
     """The finding where the reward neither rises nor falls and is not near the best reference."""
-    if not found.below(MAX_LEVEL_RISE * reward_range(rows)):
-        return Finding(
-            name,
+    if course == "varies":
+        return _progress(
             "note",
-            found.rise,
-            limit,
-            f"The reward varies too much for a trend: {measured}.",
+            found,
+            f"The reward varies too much for a trend: {found}.",
             f"more iterations (kreps resume RUN --iterations {2 * len(rows)}), or more rollouts "
             "for each (--set rollouts_per_iteration=20).",
         )
-    share = kl_share(rows[-found.iterations :])
+    share = kl_share(rows)
     if share > LOW_KL_SHARE:
-        return Finding(
-            name,
+        return _progress(
             "limit",
-            found.rise,
-            limit,
-            f"The reward does not rise ({measured}), although the updates use {share:.0%} of the "
+            found,
+            f"The reward {course}, {found}, although the updates use {share:.0%} of the "
             "KL bound: the gains that they predict are errors of the model, or noise.",
             f"more data ({MORE_DATA}), or smaller steps (--set kl_bound=0.5 {higher_floor(rows)}).",
         )
-    return Finding(
-        name,
+    return _progress(
         "fine",
-        found.rise,
-        limit,
-        f"The reward does not rise ({measured}), and the updates use {share:.0%} of the KL bound: "
+        found,
+        f"The reward {course}, {found}, and the updates use {share:.0%} of the KL bound: "
         "the run has converged.",
     )
+
+
+def _progress(severity: Severity, found: Trend, sentence: str, remedy: str = "") -> Finding:
+    return Finding("progress", severity, found.rise, float("nan"), sentence, remedy)

@@ -6,7 +6,7 @@ They are rules of thumb, chosen from a few runs, and have no effect on learning.
 from __future__ import annotations
 
 RECENT = 5
-"""Latest iterations that a mean is taken over."""
+"""Latest iterations that a median is taken over."""
 
 MIN_ITERATIONS = 8
 """Iterations from which on the last half has a trend."""
@@ -49,4 +49,4 @@ REFERENCE_TOLERANCE = 0.05
 
 MIN_REWARD_RISE, MAX_LEVEL_RISE = 0.02, 0.25
 """Smallest rise of the reward that counts as one, and largest rise of a reward that is level, as
-shares of the range of training rewards."""
+shares of the range of training rewards (`columns.reward_range`)."""

@@ -1,43 +1,60 @@
-"""The trend of a curve over the last half of its iterations, with a confidence interval."""
+"""The trend of a curve over the last half of its iterations, and the course of the reward.
+
+A trend is a Theil-Sen line: its slope is the median of the slopes between any two iterations, and
+its confidence interval lies between two of these slopes.  One bad batch turns neither.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
-from scipy.special import stdtrit
 
 from kreps.app.diagnosis.columns import Row, column, reward_range
-from kreps.app.diagnosis.thresholds import CONFIDENCE, MIN_ITERATIONS, MIN_REWARD_RISE
+from kreps.app.diagnosis.thresholds import (
+    CONFIDENCE,
+    MAX_LEVEL_RISE,
+    MIN_ITERATIONS,
+    MIN_REWARD_RISE,
+)
 from kreps.kernels.arrays import FloatArray
+
+Course = Literal["unknown", "rises", "hardly rises", "does not rise", "varies", "falls"]
+"""What the training reward does.  "varies": its noise would hide a rise that matters."""
 
 
 @dataclass(frozen=True)
 class Trend:
-    """A least-squares line through the last half of a curve.
+    """A robust line through the last half of a curve.
 
     Attributes:
         iterations: number of points that it was fitted to.
         rise: from its first to its last iteration.
-        error: quantile of its estimation error at the one-sided level `CONFIDENCE`.
+        low, high: bounds of the rise, each with the one-sided confidence `CONFIDENCE`.
     """
 
     iterations: int
     rise: float
-    error: float
+    low: float
+    high: float
 
     def rises(self, minimum: float = 0.0) -> bool:
         """Whether the rise is significant and larger than a minimum."""
-        return self.rise > max(self.error, minimum)
+        return self.low > 0.0 and self.rise > minimum
 
     def falls(self, minimum: float = 0.0) -> bool:
         """Whether the fall is significant and larger than a minimum."""
-        return -self.rise > max(self.error, minimum)
+        return self.high < 0.0 and -self.rise > minimum
 
     def below(self, maximum: float) -> bool:
         """Whether the rise is at most a maximum, with the confidence of the interval."""
-        return self.rise + self.error <= maximum
+        return self.high <= maximum
+
+    def __str__(self) -> str:
+        between = f"{2.0 * CONFIDENCE - 1.0:.0%} interval {self.low:+.2g} to {self.high:+.2g}"
+        return f"{self.rise:+.3g} ({between}) over the last {self.iterations} iterations"
 
 
 def trend(values: FloatArray) -> Trend | None:
@@ -54,12 +71,12 @@ def trend(values: FloatArray) -> Trend | None:
     half = values[len(values) // 2 :] - values[-1]
     if not np.isfinite(half).all():
         return None
-    m = len(half)
-    time = np.arange(m) - 0.5 * (m - 1)
-    slope = float(time @ half / (time @ time))
-    residuals = half - half.mean() - slope * time
-    slope_error = float(np.sqrt(residuals @ residuals / (m - 2) / (time @ time)))
-    return Trend(m, slope * (m - 1), float(stdtrit(m - 2, CONFIDENCE)) * slope_error * (m - 1))
+    from scipy.stats import theilslopes  # slow to import, and only needed here
+
+    found = theilslopes(half, alpha=2.0 * CONFIDENCE - 1.0)
+    steps = len(half) - 1
+    slopes = (found.slope, found.low_slope, found.high_slope)
+    return Trend(len(half), *(steps * float(slope) for slope in slopes))
 
 
 def reward_trend(rows: Sequence[Row]) -> Trend | None:
@@ -67,7 +84,15 @@ def reward_trend(rows: Sequence[Row]) -> Trend | None:
     return trend(column(rows, "average_reward"))
 
 
-def reward_rises(rows: Sequence[Row]) -> bool:
-    """Whether the training reward still rises."""
-    found = reward_trend(rows)
-    return found is not None and found.rises(MIN_REWARD_RISE * reward_range(rows))
+def reward_course(rows: Sequence[Row]) -> Course:
+    """What the training reward has done lately, in one word for all findings."""
+    found, scale = reward_trend(rows), reward_range(rows)
+    if found is None:
+        return "unknown"
+    if found.rises(MIN_REWARD_RISE * scale):
+        return "rises"
+    if found.falls(MIN_REWARD_RISE * scale):
+        return "falls"
+    if not found.below(MAX_LEVEL_RISE * scale):
+        return "varies"
+    return "hardly rises" if found.rises() else "does not rise"

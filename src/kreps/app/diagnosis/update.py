@@ -15,8 +15,7 @@ from kreps.app.diagnosis.columns import (
     kl_share,
     latest,
     policy_targets,
-    recent,
-    reward_range,
+    recent_share,
 )
 from kreps.app.diagnosis.finding import Finding, counted
 from kreps.app.diagnosis.remedies import MORE_DATA, higher_floor, larger_ridge
@@ -26,11 +25,10 @@ from kreps.app.diagnosis.thresholds import (
     LOW_KL_SHARE,
     MIN_EFFECTIVE_SAMPLES,
     MIN_EFFECTIVE_SHARE,
-    MIN_REWARD_RISE,
     RECENT,
     REJECTED_NOTE,
 )
-from kreps.app.diagnosis.trend import reward_rises, reward_trend
+from kreps.app.diagnosis.trend import reward_course
 
 
 def dual_solver(rows: Sequence[Row]) -> Finding:
@@ -76,9 +74,9 @@ def kl_bound(rows: Sequence[Row]) -> Finding:
     """Whether the KL bound or the temperature floor limits the step."""
     name = "KL bound"
     late = rows[-RECENT:]
-    share = kl_share(late)
+    share = kl_share(rows)
     used = f"The updates use {share:.0%} of the KL bound ({latest(rows, 'kl_bound'):g})"
-    if share >= HIGH_KL_SHARE and reward_rises(rows):
+    if share >= HIGH_KL_SHARE and reward_course(rows) == "rises":
         return Finding(
             name,
             "limit",
@@ -97,8 +95,8 @@ def _at_floor(rows: Sequence[Row], name: str, share: float, used: str) -> Findin
     """The finding where the temperature floor limits the step and not the KL bound."""
     floor = latest(rows, "eta_floor")
     shown = f" ({floor:.2g})" if np.isfinite(floor) else ""
-    found = reward_trend(rows)
-    if found is None or found.rises(MIN_REWARD_RISE * reward_range(rows)):
+    course = reward_course(rows)
+    if course not in ("does not rise", "hardly rises"):
         return Finding(
             name,
             "fine",
@@ -112,7 +110,7 @@ def _at_floor(rows: Sequence[Row], name: str, share: float, used: str) -> Findin
         "note",
         share,
         LOW_KL_SHARE,
-        f"{used}, because eta is at its floor{shown}, and the reward no longer rises: the run has "
+        f"{used}, because eta is at its floor{shown}, and the reward {course}: the run has "
         "converged, given its data and its model.",
         f"more data for each update if the reward is too low ({MORE_DATA}){lower}.",
     )
@@ -122,8 +120,8 @@ def effective_samples(rows: Sequence[Row]) -> Finding:
     """Whether enough samples have a weight after the update."""
     name = "effective sample size"
     late = rows[-RECENT:]
-    count = float(np.mean(effective_share(late) * policy_targets(late)))
-    share = float(np.mean(effective_share(late)))
+    count = float(np.median(effective_share(late) * policy_targets(late)))
+    share = float(np.median(effective_share(late)))
     remedy = f"smaller steps (--set kl_bound=0.5), or more rollouts ({MORE_DATA})."
     if count < MIN_EFFECTIVE_SAMPLES:
         return Finding(
@@ -156,7 +154,7 @@ def effective_samples(rows: Sequence[Row]) -> Finding:
 def acceptance_test(rows: Sequence[Row]) -> Finding | None:
     """Whether new policies pass the acceptance test; None if no update had one."""
     name = "acceptance test"
-    share = recent(rows, "rejected")
+    share = recent_share(rows, "rejected")
     if not np.isfinite(share):
         return None
     rejected = f"The acceptance test rejected {share:.0%} of the latest policies"
