@@ -11,6 +11,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.special import logsumexp
 
+from kreps.algorithms import newton_step
 from kreps.algorithms.dual import (
     MIN_ETA,
     DualProblem,
@@ -27,14 +28,7 @@ from kreps.algorithms.dual import (
     sample_weights,
     standardise,
 )
-from kreps.algorithms.newton import (
-    CENTRED_DECREMENT,
-    DECREMENT_TOLERANCE,
-    GAP_TOLERANCE,
-    KL_TOLERANCE,
-    minimise_by_newton,
-    solve_dual,
-)
+from kreps.algorithms.newton import minimise_by_newton, solve_dual
 from kreps.kernels.arrays import FloatArray, IntArray
 from kreps.kernels.basis import RBFGrid
 from kreps.kernels.kernel import Kernel, factors_of
@@ -42,11 +36,14 @@ from kreps.kernels.regression import SampleModel
 
 TINY_FLOOR = 1e-6
 
+DECREMENT_TOLERANCE, GAP_TOLERANCE, KL_TOLERANCE = 1e-9, 1e-6, 1e-4
+"""As the solver documents them."""
+
 
 def random_problem(
     seed: int, n: int = 80, r: int = 7, *, kl_bound: float = 0.5, ridge: float = 0.01
 ) -> DualProblem:
-    """Features that explain part of the rewards, as those of a value function do."""
+    """Features that explain a part of the rewards."""
     rng = np.random.default_rng(seed)
     differences = rng.normal(0.0, 0.4, size=(n, r))
     rewards, _ = standardise(rng.gamma(2.0, size=n) + differences @ rng.normal(size=r))
@@ -54,7 +51,7 @@ def random_problem(
 
 
 def value_by_the_book(problem: DualProblem, eta: float, theta: FloatArray) -> float:
-    """Eq. 2 with the lost epsilon and the ridge, by an independent log-sum-exp."""
+    """Eq. 2 with its epsilon and the ridge, by an independent log-sum-exp."""
     delta = problem.rewards + problem.differences @ theta
     soft_maximum = logsumexp(delta / eta) - np.log(len(delta))
     return float(
@@ -63,7 +60,7 @@ def value_by_the_book(problem: DualProblem, eta: float, theta: FloatArray) -> fl
 
 
 def assert_optimal(problem: DualProblem, found: DualSolution) -> None:
-    """What must hold at every solution, whichever way it was reached."""
+    """Optimality conditions and certificate of a solution."""
     assert found.converged
     assert found.weights.sum() == pytest.approx(1.0, abs=1e-12)
     assert (found.weights >= 0.0).all()
@@ -104,7 +101,7 @@ def test_equal_rewards_standardise_to_zeros(value: float) -> None:
     assert unit == 1.0
 
 
-def test_a_small_spread_on_a_large_offset_is_not_taken_for_none() -> None:
+def test_small_differences_of_large_rewards_are_standardised() -> None:
     found, unit = standardise(1e6 + np.array([0.0, 1e-3, 2e-3]))
     np.testing.assert_allclose(found, [-2.449, -1.225, 0.0], atol=1e-3)
     assert unit == pytest.approx(8.165e-4, rel=1e-3)
@@ -120,7 +117,7 @@ def test_bellman_errors_are_rewards_plus_differences_of_v() -> None:
     np.testing.assert_allclose(bellman_errors(problem, theta), wanted)
 
 
-def test_weights_are_the_normalised_exponentials_and_do_not_feel_a_shift() -> None:
+def test_weights_are_the_normalised_exponentials_and_invariant_to_a_shift() -> None:
     delta = np.array([0.3, -1.0, 2.0])
     wanted = np.exp(delta / 0.7) / np.exp(delta / 0.7).sum()
     np.testing.assert_allclose(sample_weights(delta, 0.7), wanted)
@@ -139,7 +136,7 @@ def test_kl_and_effective_sample_size_of_known_weights() -> None:
     assert effective_sample_size(p) == pytest.approx(1.0 / 0.375)
 
 
-def test_the_primal_value_is_the_reward_less_the_price_of_imbalance() -> None:
+def test_the_primal_value_is_the_reward_less_the_penalty_of_nonstationarity() -> None:
     problem = random_problem(1)
     p = np.random.default_rng(2).dirichlet(np.ones(80))
     imbalance = sum(p[i] * problem.differences[i] for i in range(80))
@@ -216,7 +213,7 @@ def test_the_dual_is_convex_along_random_segments(seed: int) -> None:
         values = [dual_value(problem, eta, theta) for eta, theta in ends]
         chord = share * values[0] + (1.0 - share) * values[1]
         assert dual_value(problem, *middle) <= chord + 1e-10
-    # Nor is it convex by being flat.
+    # and it is not flat
     assert np.linalg.eigvalsh(dual_hessian(problem, *ends[0])).min() > 1e-4
 
 
@@ -288,7 +285,7 @@ def test_no_feasible_weights_beat_the_dual(seed: int) -> None:
 
 
 def floor_problem(seed: int) -> DualProblem:
-    """The bound would ask for a temperature below the floor."""
+    """At the KL bound the temperature would be below the floor."""
     problem = random_problem(seed, kl_bound=2.0)
     free = solve_dual(problem)
     assert free.outcome is Outcome.BOUND_ACTIVE
@@ -334,10 +331,10 @@ def test_a_floor_below_the_optimum_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("floor", [TINY_FLOOR, 0.1])
-def test_equal_rewards_leave_the_samples_as_they_are(floor: float) -> None:
+def test_equal_rewards_on_stationary_samples_give_uniform_weights(floor: float) -> None:
     rewards, _ = standardise(np.full(80, -3.7))
     centred = random_problem(2).differences
-    centred = centred - centred.mean(axis=0)  # already stationary: nothing to do
+    centred = centred - centred.mean(axis=0)  # already stationary
     found = solve_dual(DualProblem(rewards, centred, 0.5, 0.01, floor))
     assert found.outcome is Outcome.AT_FLOOR
     np.testing.assert_allclose(found.weights, 1.0 / 80, atol=1e-9)
@@ -346,7 +343,7 @@ def test_equal_rewards_leave_the_samples_as_they_are(floor: float) -> None:
 
 
 @pytest.mark.parametrize("floor", [TINY_FLOOR, 0.1])
-def test_equal_rewards_on_unbalanced_samples_only_balance_them(floor: float) -> None:
+def test_equal_rewards_on_nonstationary_samples_only_reduce_the_residual(floor: float) -> None:
     problem = replace(random_problem(3), rewards=np.zeros(80), eta_floor=floor)
     found = solve_dual(problem)
     assert_optimal(problem, found)
@@ -384,7 +381,7 @@ def test_a_bound_that_cannot_be_reached_ends_at_the_floor() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_an_optimum_at_a_tiny_floor_is_recognised_with_many_features(seed: int) -> None:
-    # Nearly as many features as samples: balancing them leaves the bound no room.
+    # with nearly as many features as samples, stationarity leaves no room for the bound
     rng = np.random.default_rng(seed)
     rewards, _ = standardise(rng.normal(size=40))
     differences = rng.normal(0.0, 0.5, size=(40, 38))
@@ -393,7 +390,7 @@ def test_an_optimum_at_a_tiny_floor_is_recognised_with_many_features(seed: int) 
     assert found.kl < problem.kl_bound
     assert found.eta == pytest.approx(TINY_FLOOR, rel=1e-9)
     assert found.outcome is Outcome.AT_FLOOR
-    # a temperature that did not wait for theta took 125 to 146, with the fallback
+    # without waiting for theta there were 125 to 146, with the fallback
     assert found.iterations < 50
 
 
@@ -419,7 +416,7 @@ def test_the_order_of_the_samples_does_not_matter() -> None:
     )
 
 
-def test_duplicated_features_are_served() -> None:
+def test_duplicated_features_have_the_same_weights() -> None:
     problem = random_problem(6)
     doubled = replace(problem, differences=np.tile(problem.differences, (1, 2)), ridge=0.02)
     # Twice the features at twice the ridge are the same penalty on V.
@@ -606,7 +603,7 @@ def test_moments_of_chunks_add_up_to_those_of_all_samples(cuts: list[int], order
 
 @pytest.mark.parametrize("order", [0, -1, 1])
 @pytest.mark.parametrize("apart", [0.3, 3.0, 30.0, 1e4])
-def test_chunks_far_below_the_others_neither_overflow_nor_count(apart: float, order: int) -> None:
+def test_chunks_with_far_lower_errors_neither_overflow_nor_count(apart: float, order: int) -> None:
     # At eta = 0.1 a chunk that is 1e4 lower weighs exp(-1e5): nothing, but not NaN either.
     problem = random_problem(82)
     lower = np.repeat([1.0, 0.0, 2.0, 0.0], 20) * apart
@@ -635,7 +632,7 @@ def test_the_kl_of_moments_is_that_of_the_weights(eta: float) -> None:
         )
 
 
-def test_a_covariance_is_made_only_where_it_is_asked_for() -> None:
+def test_the_covariance_is_computed_only_on_request() -> None:
     pieces = InPieces.of(random_problem(86), cut(80, [10], 0))
     assert pieces.moments(1.0, np.zeros(7), with_covariance=False).covariance is None
     covariance = pieces.moments(1.0, np.zeros(7), with_covariance=True).covariance
@@ -664,17 +661,19 @@ def test_the_solution_does_not_depend_on_where_the_solver_starts(seed: int) -> N
     near = solve_dual(half)
     far = np.random.default_rng(seed).normal(size=7)
     for eta, theta in [(near.eta, near.theta), (30.0, np.zeros(7)), (0.2, far)]:
-        end = minimise_by_newton(problem, eta, theta, 80)  # whether or not the start is better
+        end = minimise_by_newton(
+            problem, eta, theta, 80
+        )  # also from a start that is worse than zero
         assert end.converged
         weights = sample_weights(problem.bellman_errors(end.point.theta), end.point.eta)
-        # What the tolerance of the KL bound leaves open; measured: up to 4e-5.
+        # the tolerance of the KL bound; measured: up to 4e-5
         np.testing.assert_allclose(weights, cold.weights, atol=1e-4 * cold.weights.max())
     assert_optimal(problem, solve_dual(problem, start=(near.eta, near.theta)))
     assert solve_dual(problem, start=(cold.eta, cold.theta)).iterations == 0
 
 
-def test_a_start_that_is_worse_than_none_is_not_taken() -> None:
-    """At the floor a wrong V decides over single samples, and Newton's steps would be tiny."""
+def test_a_start_that_is_worse_than_zero_is_not_used() -> None:
+    """With a wrong V at the floor single samples have all weight, and steps would be tiny."""
     problem = floor_problem(0)
     cold = solve_dual(problem)
     wrong = 1e3 * np.random.default_rng(0).normal(size=problem.rank)
@@ -701,7 +700,7 @@ def test_the_floor_is_found_from_a_start_at_it_and_from_far_above_it() -> None:
         np.testing.assert_allclose(weights, cold.weights, atol=1e-5)
 
 
-def test_a_temperature_that_was_too_low_is_left() -> None:
+def test_a_temperature_that_starts_too_low_rises() -> None:
     problem = random_problem(0)
     wanted = solve_dual(problem)
     assert wanted.outcome is Outcome.BOUND_ACTIVE
@@ -719,7 +718,7 @@ def test_without_features_only_the_temperature_is_found() -> None:
 
 def test_a_run_whose_temperature_waits_for_theta_is_not_converged() -> None:
     """KL is not tested while eta waits, so the decrement has to exceed its tolerance then."""
-    assert CENTRED_DECREMENT * MIN_ETA > DECREMENT_TOLERANCE
+    assert newton_step.CENTRED_DECREMENT * MIN_ETA > newton_step.DECREMENT_TOLERANCE
 
 
 @dataclass(frozen=True)
