@@ -268,7 +268,7 @@ class Stop:
     ],
 )
 def test_a_wrong_callback_is_refused_before_anything_is_collected(callback: Any, says: str) -> None:
-    env = Unstarted(gym.make("kreps/SwingUp-v0"))
+    env = Unstarted(gym.make("Pendulum-v1"))
     with pytest.raises(ConfigurationError, match=says):
         kreps.KREPS(env, **TINY).learn(1, callback=callback, progress=False)
 

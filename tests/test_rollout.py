@@ -18,8 +18,9 @@ from kreps.envs.swing_up import SwingUp
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.collect import collect, simulate
-from kreps.learning.environment import batch_model_of, task_of, without_restarts
+from kreps.learning.environment import batch_model_of, task_of
 from kreps.learning.evaluate import discounted_average
+from kreps.learning.wrappers import without_restarts
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.exploration import RED, BangBang
 from kreps.seeding import Purpose, generator, integer_seed

@@ -1,8 +1,9 @@
-"""What is read from a Gymnasium environment: its task, limits, batch model and restarts."""
+"""What is read from a Gymnasium environment: its task, limits and batch model."""
 
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -11,14 +12,29 @@ import numpy as np
 
 from kreps.data.task import TaskSpec
 from kreps.envs.batch import BatchModel
-from kreps.envs.restart import RandomRestart
 from kreps.errors import ConfigurationError, SpaceError
+from kreps.kernels.arrays import FloatArray
+from kreps.learning.wrappers import Environment as Environment
+from kreps.learning.wrappers import (
+    keeps_observations,
+    metadata_of,
+    warn_about_state,
+    without_restarts,
+)
 
-Environment = gym.Env[Any, Any]
+ANGLES, GROUPS, IMAGE_SHAPE = (
+    "periodic_coordinates",
+    "observation_groups",
+    "observation_image_shape",
+)
+"""Keys of ``env.metadata`` about the coordinates of observations."""
 
 
 def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec:
     """The specification of an environment's task.
+
+    Metadata are used only if no wrapper around the environment that they belong to may change the
+    observations; otherwise there is a `UserWarning`.
 
     Args:
         env: any Gymnasium environment with Box observations and bounded Box actions.
@@ -29,10 +45,25 @@ def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec
         ConfigurationError: not an environment.
         SpaceError: a space that is not supported.
     """
+    size, low, high = _sizes_and_limits(env)
+    keys = (ANGLES, GROUPS, IMAGE_SHAPE) if periodic is None else (GROUPS, IMAGE_SHAPE)
+    metadata = _observation_metadata(env, keys)
+    return TaskSpec(
+        observation_size=size,
+        action_low=low,
+        action_high=high,
+        periodic=tuple(metadata.get(ANGLES, ()) if periodic is None else periodic),
+        groups=tuple(metadata.get(GROUPS, ())),
+        image_shape=metadata.get(IMAGE_SHAPE),
+    )
+
+
+def _sizes_and_limits(env: Environment) -> tuple[int, FloatArray, FloatArray]:
+    """Number of observation coordinates, and limits (da,) of the actions, of supported spaces."""
     if not isinstance(env, gym.Env):
         raise ConfigurationError(
-            f"{env!r} is a {type(env).__name__}, but a single gymnasium.Env is needed; make one "
-            "with gymnasium.make(name)"
+            f"{env!r:.60} is a {type(env).__name__}, but a single gymnasium.Env is needed; make "
+            "one with gymnasium.make(name)"
         )
     observations, actions = env.observation_space, env.action_space
     if not isinstance(observations, gym.spaces.Box):
@@ -51,54 +82,65 @@ def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec
             f"the action space {actions} is unbounded, but the first policy explores within finite "
             "limits; set them with gymnasium.wrappers.TransformAction and a bounded Box"
         )
-    if periodic is None:
-        periodic = (env.metadata or {}).get("periodic_coordinates", ())
-    return TaskSpec(
-        observation_size=int(np.prod(observations.shape)),
-        action_low=actions.low.ravel(),
-        action_high=actions.high.ravel(),
-        periodic=tuple(periodic),
-        groups=tuple((env.metadata or {}).get("observation_groups", ())),
-        image_shape=(env.metadata or {}).get("observation_image_shape"),
-    )
+    low, high = (np.array(limit, np.float64).ravel() for limit in (actions.low, actions.high))
+    return int(np.prod(observations.shape)), low, high
 
 
-def require_same_shape(found: TaskSpec, task: TaskSpec) -> None:
-    """Raise `ConfigurationError` unless an environment's task has the sizes and limits of ``task``.
+def _observation_metadata(env: Environment, keys: tuple[str, ...]) -> dict[str, Any]:
+    """Metadata about the observations that a learner gets.
 
     Args:
-        found: of the environment.
-        task: of a checkpoint.
+        env: the environment with its wrappers.
+        keys: what is asked for.  There is a `UserWarning` if a wrapper makes one of them unusable.
     """
-    same = found.observation_size == task.observation_size and (
-        np.array_equal(found.action_low, task.action_low)
-        and np.array_equal(found.action_high, task.action_high)
+    metadata, left_out = metadata_of(env, keeps_observations)
+    unusable = [key for key in keys if key in left_out]
+    if unusable:
+        names = left_out[unusable[-1]]
+        images = "" if unusable == [ANGLES] else f"; for images set the metadata of {names[0]}"
+        warnings.warn(
+            f"{' and '.join(names)} may change the observations, so metadata of the environment "
+            f"inside are not used: {', '.join(unusable)}. Say which coordinates that the learner "
+            f"gets are angles: periodic=[...], or [] for none{images}",
+            UserWarning,
+            stacklevel=5,
+        )
+    return metadata
+
+
+def environment_for(env: Environment, task: TaskSpec, restart_probability: float) -> Environment:
+    """The environment that a learner collects in, without its random restarts.
+
+    The only way into a learner, for a new one and for one that is resumed.
+
+    Args:
+        env: as given by the user.  There is a `UserWarning` if a wrapper has running statistics.
+        task: of the learner.
+        restart_probability: of the learner.
+
+    Raises:
+        ConfigurationError: no environment, one with other sizes, limits or restarts.
+        SpaceError: a space that is not supported.
+    """
+    size, low, high = _sizes_and_limits(env)
+    same = size == task.observation_size and (
+        np.array_equal(low, task.action_low) and np.array_equal(high, task.action_high)
     )
     if not same:
         raise ConfigurationError(
-            f"the environment has {found.observation_size} observation coordinates and actions in "
-            f"{found.action_low} to {found.action_high}, the checkpoint {task.observation_size} "
-            f"and {task.action_low} to {task.action_high}; resume in the environment of the "
-            "checkpoint"
+            f"the environment has {size} observation coordinates and actions in {low} to {high}, "
+            f"the learner {task.observation_size} and {task.action_low} to {task.action_high}; "
+            "resume in the environment that it was learnt in"
         )
-
-
-def without_restarts(env: Environment) -> tuple[Environment, float | None]:
-    """The environment inside an outermost `RandomRestart`, and the restart probability.
-
-    The probability is None, and the environment itself is returned, if it has no such wrapper.
-
-    Raises:
-        ConfigurationError: a `RandomRestart` below other wrappers.
-    """
-    if isinstance(env, RandomRestart):
-        return env.env, env.restart_probability
-    if env.has_wrapper_attr("restart_probability"):
+    inside, probability = without_restarts(env)
+    if probability is not None and probability != restart_probability:
         raise ConfigurationError(
-            "the environment has a RandomRestart below other wrappers; make it the outermost "
-            "wrapper"
+            f"restart_probability = {restart_probability!r}, but the environment's RandomRestart "
+            f"has {probability!r}; give the environment without RandomRestart, or with the same "
+            "probability"
         )
-    return env, None
+    warn_about_state(env)
+    return inside
 
 
 def batch_model_of(env: Environment) -> BatchModel | None:

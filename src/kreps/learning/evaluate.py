@@ -16,7 +16,7 @@ from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.collect import simulate
-from kreps.learning.environment import Environment, without_restarts
+from kreps.learning.wrappers import Environment, without_restarts
 from kreps.policies.base import LearntPolicy, StochasticPolicy
 from kreps.seeding import Purpose, generator, integer_seed
 

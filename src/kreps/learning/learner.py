@@ -25,13 +25,9 @@ from kreps.kernels.arrays import FloatArray
 from kreps.kernels.threads import blas_threads
 from kreps.learning import storage
 from kreps.learning.collect import collect
-from kreps.learning.environment import (
-    Environment,
-    require_same_shape,
-    task_of,
-    without_restarts,
-)
+from kreps.learning.environment import Environment, environment_for, task_of
 from kreps.learning.policy import Policy
+from kreps.learning.wrappers import without_restarts
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.exploration import PINK, RED, WHITE, BangBang, Gaussian
 from kreps.presets import changed, flat
@@ -116,7 +112,7 @@ class Learner(Generic[MethodSettings]):
             random as in the paper (Sec. 4.1), so its episodes need not end.
         seed: of all random numbers; the same seed gives the same policy, byte for byte.
         periodic: coordinates of the observation that are angles in rad; None takes them from
-            ``env.metadata["periodic_coordinates"]``.
+            ``env.metadata["periodic_coordinates"]``, unless a wrapper may change observations.
         threads: BLAS threads while learning; None leaves the number unchanged.  Another number may
             change the last bits of a policy, so learners that run at the same time in threads of
             one process must agree on it.
@@ -155,15 +151,12 @@ class Learner(Generic[MethodSettings]):
             self.task = env
         else:
             self.task = task_of(env, periodic)
-            self.env, probability = without_restarts(env)
+            _, probability = without_restarts(env)
             if probability is not None:
-                given = settings.setdefault("restart_probability", probability)
-                if given != probability:
-                    raise ConfigurationError(
-                        f"restart_probability = {given!r}, but the environment's RandomRestart has "
-                        f"{probability!r}; give only one of them"
-                    )
+                settings.setdefault("restart_probability", probability)
         self.settings = self._settings(settings)
+        if not isinstance(env, TaskSpec):
+            self.env = environment_for(env, self.task, self.settings.restart_probability)
         self.threads = None if threads is None else max(1, _whole_number("threads", threads))
         self.state = LearnerState(ReplayWindow(self.task, self.settings.window))
         self._policy: Policy | None = None
@@ -323,15 +316,18 @@ class Learner(Generic[MethodSettings]):
             path: written by `save`.
             env: the environment to continue in; None if all data comes through `update`.
 
+        What is no setting is not stored: set ``threads`` (and ``compute`` of KREPS) again if they
+        were changed.
+
         Raises:
             StorageError: the file is missing, damaged or not a checkpoint of this method.
-            ConfigurationError: the environment has other observation or action sizes or limits.
+            ConfigurationError: no environment, or one with other observation or action sizes,
+                limits or random restarts.
         """
         state, task, settings, seed = storage.load_checkpoint(path, cls.method, cls.settings_type)
         learner = cls(task, seed=seed, **flat(settings))
         if env is not None:
-            learner.env, _ = without_restarts(env)
-            require_same_shape(task_of(env, task.periodic), task)
+            learner.env = environment_for(env, task, settings.restart_probability)
         learner.state = state
         return learner
 
