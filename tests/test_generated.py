@@ -290,7 +290,14 @@ def still_world(model_env: Any, n: int = 120, bonus: NoveltyBonus | None = None)
 
 @pytest.mark.parametrize(
     ("fraction", "replay", "visited"),
-    [(0.0, 480, 0), (0.25, 360, 120), (0.5, 240, 240), (1.0, 0, 480), (1e-3, 480, 0)],
+    [
+        (0.0, 480, 0),
+        (1e-3, 480, 0),
+        (0.25, 360, 120),
+        (0.5, 240, 240),
+        (0.999, 0, 480),
+        (1.0, 0, 480),
+    ],
 )
 def test_the_budget_is_split_between_the_sources(
     fraction: float, replay: int, visited: int
