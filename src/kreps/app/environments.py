@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -36,14 +37,26 @@ def make_environment(environment: str, **options: Any) -> Environment:
         ) from error
 
 
+def metadata_of(env: Environment) -> Mapping[str, Any]:
+    """The environment's metadata; empty if it is no mapping."""
+    metadata = env.metadata
+    return metadata if isinstance(metadata, Mapping) else {}
+
+
 def labels_of(env: Environment, task: TaskSpec) -> Labels:
-    """Labels from the environment's metadata, or numbered ones."""
-    metadata = env.metadata or {}
-    observations = metadata.get("observation_labels") or [
-        f"observation {i}" for i in range(task.observation_size)
-    ]
-    actions = metadata.get("action_labels") or [f"action {i}" for i in range(task.action_size)]
-    return Labels(list(observations), list(actions))
+    """Labels from the environment's metadata, or numbered ones where those are not usable.
+
+    A dollar sign is escaped, as Matplotlib would read mathematics between two of them.
+    """
+    metadata = metadata_of(env)
+
+    def labels(kind: str, count: int) -> list[str]:
+        given = metadata.get(f"{kind}_labels")
+        if not isinstance(given, list | tuple) or len(given) != count:
+            return [f"{kind} {i}" for i in range(count)]
+        return [str(label).replace("$", r"\$") for label in given]
+
+    return Labels(labels("observation", task.observation_size), labels("action", task.action_size))
 
 
 def references_of(config: RunConfig) -> dict[str, float]:

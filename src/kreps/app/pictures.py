@@ -8,13 +8,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from kreps.app.console import console
 from kreps.app.diagnosis import Finding
-from kreps.app.environments import labels_of, make_environment, references_of
+from kreps.app.environments import (
+    labels_of,
+    make_environment,
+    metadata_of,
+    references_of,
+)
+from kreps.app.recording import record
 from kreps.app.run_folder import RunFolder
-from kreps.errors import EnvironmentFailure
+from kreps.errors import ConfigurationError
 from kreps.learning.methods import KREPS
 from kreps.learning.policy import Policy
 
@@ -62,39 +66,38 @@ def film_run(
         out: a ``.gif`` file; ``video.gif`` in the run if None.
 
     Raises:
-        ConfigurationError: ``out`` does not end in ``.gif``, or the environment cannot be made.
-        EnvironmentFailure: the environment raised, for example because it cannot be drawn.
+        ConfigurationError: ``out`` does not end in ``.gif``, or the environment cannot be made or
+            has no pictures among its render modes.
+        EnvironmentFailure: the environment raised, or returned no picture.
+        StorageError: the film cannot be written.
     """
-    from kreps.app.plots.film import Recording, check_film_name, film
+    from kreps.app.plots.film import check_film_name, film
 
     path = out or folder.path / "video.gif"
     check_film_name(path)
+    _require_pictures(learner)
     env = make_environment(folder.config().environment, render_mode="rgb_array")
     policy = Policy(learner.policy.process, seed)
-    frames, observations, actions = [], [], []
     with console.status("filming ..."):
         try:
-            observation, _ = env.reset(seed=seed)
-            for _ in range(steps):
-                action, _ = policy.predict(observation.ravel(), deterministic=not stochastic)
-                frames.append(env.render())
-                observations.append(observation.ravel())
-                actions.append(action)
-                space = env.action_space
-                observation, _, terminated, truncated, _ = env.step(
-                    action.astype(space.dtype).reshape(space.shape or ())
-                )
-                if terminated or truncated:
-                    break
-        except Exception as error:  # whatever a foreign environment raises
-            raise EnvironmentFailure(
-                f"the environment cannot be filmed, it raised {type(error).__name__}: {error}"
-            ) from error
+            recording = record(env, policy, steps, seed, deterministic=not stochastic)
         finally:
             env.close()
-        fps = float(env.metadata.get("render_fps", 20))
-        recording = Recording(frames, np.array(observations), np.array(actions), fps)
         return film(recording, learner.state, learner.task, labels_of(env, learner.task), path)
+
+
+def _require_pictures(learner: KREPS) -> None:
+    """Raise `ConfigurationError` if the environment names its render modes and none are arrays.
+
+    Then it need not be made a second time.
+    """
+    assert learner.env is not None
+    modes = metadata_of(learner.env).get("render_modes")
+    if isinstance(modes, list | tuple) and modes and "rgb_array" not in modes:
+        raise ConfigurationError(
+            f"the environment draws no pictures: its render_modes are {modes}, and a film needs "
+            '"rgb_array"'
+        )
 
 
 def draw_diagnosis(folder: RunFolder, findings: Sequence[Finding], path: Path) -> Path:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib import rc_context
@@ -16,30 +15,18 @@ from PIL import Image
 from kreps.algorithms.state import LearnerState
 from kreps.app.environments import Labels
 from kreps.app.plots.plane import label_axes, path_of, state_grid
+from kreps.app.recording import Recording
 from kreps.data.task import TaskSpec
-from kreps.errors import ConfigurationError, StorageError
+from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import FloatArray
+from kreps.learning.storage import write_atomically
 from kreps.plotting import STYLE
 
 FILM_COLOURS = 96
 """Colours of the palette that all pictures of a film share."""
 
-
-@dataclass(frozen=True)
-class Recording:
-    """A rollout with its pictures.
-
-    Attributes:
-        frames: T pictures (height, width, 3).
-        observations: (T, ds), one for each picture.
-        actions: (T, da), taken at these observations.
-        fps: pictures per second.
-    """
-
-    frames: Sequence[Any]
-    observations: FloatArray
-    actions: FloatArray
-    fps: float
+MIN_DURATION = 20
+"""Of a picture in ms: viewers show faster ones much more slowly."""
 
 
 def check_film_name(path: Path) -> None:
@@ -78,7 +65,7 @@ def film(
         for t, frame in enumerate(recording.frames):
             picture.set_data(frame)
             action = recording.actions[t, 0]
-            text.set_text(f"t = {t / recording.fps:5.2f} s   {labels.actions[0]} {action:7.2f}")
+            text.set_text(f"t = {t / recording.fps:5.2f} s   {labels.actions[0]} {action:9.3g}")
             if draw_path is not None:
                 draw_path(recording.observations[: t + 1])
             canvas.draw()  # type: ignore[no-untyped-call]
@@ -114,7 +101,7 @@ def _write_gif(images: Sequence[Image.Image], fps: float, path: Path) -> None:
     # one palette without dithering: successive pictures then differ only where things move
     palette = images[len(images) // 2].quantize(FILM_COLOURS, dither=Image.Dither.NONE)
     first, *others = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
-    try:
-        first.save(path, save_all=True, append_images=others, duration=round(1000 / fps), loop=0)
-    except OSError as error:
-        raise StorageError(f"cannot write the film {path}: {error}; check the folder") from error
+    duration = max(round(1000 / fps), MIN_DURATION)
+    content = io.BytesIO()
+    first.save(content, "GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    write_atomically(path, content.getvalue())
