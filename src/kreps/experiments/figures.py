@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 
 from kreps.envs.image_swing_up import PIXELS
@@ -19,7 +18,7 @@ from kreps.experiments.specs import METHODS, TASKS
 from kreps.experiments.tables import markdown
 from kreps.experiments.trials import commits_of
 from kreps.learning.collect import simulate
-from kreps.learning.environment import task_of
+from kreps.learning.environment import opened, task_of
 from kreps.learning.storage import write_atomically
 from kreps.policies.exploration import BangBang
 from kreps.seeding import Purpose, generator, integer_seed
@@ -239,11 +238,11 @@ def draw_features(path: Path) -> Path:
     from kreps import plotting  # Matplotlib is slow to import
     from kreps.experiments import plots
 
-    env = gym.make("kreps/ImageSwingUp-v0")
-    task = task_of(env)
     seeds = [integer_seed(0, Purpose.ENVIRONMENT, 0, 0)]
-    noise = [generator(0, Purpose.POLICY, 0, 0).standard_normal((41, task.action_size))]
-    (rollout,) = simulate(env, task, BangBang(task), seeds, noise)
+    noise = [generator(0, Purpose.POLICY, 0, 0).standard_normal((41, 1))]
+    with opened("kreps/ImageSwingUp-v0") as env:
+        task = task_of(env)
+        (rollout,) = simulate(env, task, BangBang(task), seeds, noise)
     shown = np.arange(1, 41, 5)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure = plots.image_features(

@@ -9,11 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
 from kreps.errors import StorageError
 from kreps.experiments.specs import METHODS, TASKS
 from kreps.kernels.threads import blas_threads
+from kreps.learning.environment import opened
 from kreps.learning.evaluate import evaluate, stochastic_and_greedy
 from kreps.learning.learner import IterationReport, Learner
 from kreps.learning.methods import LEARNERS
@@ -116,11 +115,10 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     Returns:
         ``trial``: its description; ``rows``: one per iteration.
     """
-    env = gym.make(trial.environment)
     rows: list[dict[str, Any]] = []
 
     def add_row(learner: Learner[Any], report: IterationReport) -> None:
-        assert learner.state.policy is not None
+        assert learner.env is not None and learner.state.policy is not None
         row: dict[str, Any] = {
             "task": trial.task,
             "method": trial.method,
@@ -132,7 +130,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
         for name, policy in stochastic_and_greedy(learner.state.policy).items():
             with blas_threads(1):
                 evaluation = evaluate(
-                    env,
+                    learner.env,
                     learner.task,
                     policy,
                     restart_probability=learner.settings.restart_probability,
@@ -147,8 +145,9 @@ def run_trial(trial: Trial) -> dict[str, Any]:
         row["samples"] = report.update.samples
         rows.append({**row, **report.update.numbers()})
 
-    learner = LEARNERS[trial.learner](env, seed=trial.seed, **trial.options)
-    learner.learn(trial.iterations, callback=add_row, progress=False)
+    with opened(trial.environment) as env:
+        learner = LEARNERS[trial.learner](env, seed=trial.seed, **trial.options)
+        learner.learn(trial.iterations, callback=add_row, progress=False)
     return {"trial": trial.description(), "rows": rows}
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, cast
 
 import gymnasium as gym
@@ -12,7 +13,7 @@ import numpy as np
 
 from kreps.data.task import TaskSpec
 from kreps.envs.batch import BatchModel
-from kreps.errors import ConfigurationError, SpaceError
+from kreps.errors import ConfigurationError, EnvironmentFailure, SpaceError
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.wrappers import Environment as Environment
 from kreps.learning.wrappers import (
@@ -28,6 +29,48 @@ ANGLES, GROUPS, IMAGE_SHAPE = (
     "observation_image_shape",
 )
 """Keys of ``env.metadata`` about the coordinates of observations."""
+
+
+@contextmanager
+def opened(name: str, arguments: Mapping[str, Any] | None = None) -> Iterator[Environment]:
+    """A new environment, which is closed at the end, after an error, and after Ctrl-C.
+
+    Every environment that kreps makes is made here: that of a robot must not stay powered.
+
+    Args:
+        name: Gymnasium name; ``module:name`` imports the module first.
+        arguments: of ``gymnasium.make``.
+
+    Raises:
+        ConfigurationError: it cannot be made.
+        EnvironmentFailure: it cannot be closed; a `UserWarning` if there is another error already.
+    """
+    try:
+        env: Environment = gym.make(name, **(arguments or {}))
+    except Exception as error:  # whatever a foreign environment raises
+        raise ConfigurationError(
+            f"cannot make the environment {name!r}: {error}; check its name and arguments, or "
+            "write module:name to have its module imported first"
+        ) from error
+    try:
+        yield env
+    except BaseException:
+        try:
+            env.close()
+        except Exception as error:
+            warnings.warn(_not_closed(name, error), UserWarning, stacklevel=3)
+        raise
+    try:
+        env.close()
+    except Exception as error:
+        raise EnvironmentFailure(_not_closed(name, error)) from error
+
+
+def _not_closed(name: str, error: Exception) -> str:
+    return (
+        f"close() of the environment {name!r} raised {type(error).__name__}: {error}; check "
+        "whether it is still powered"
+    )
 
 
 def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec:
