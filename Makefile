@@ -3,7 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench format clean constraints tables
+.PHONY: demo test check bench format clean constraints tables dist
 
 demo: .venv/installed           ## learn the swing-up; writes pictures and policy to runs/demo
 	rm -rf runs/demo
@@ -38,6 +38,13 @@ constraints:                    ## update constraints.txt (needs uv)
 
 tables:                         ## write the tables of results/ into the documentation pages
 	$(PYTHON) docs/fill_tables.py
+
+dist: .venv/installed           ## wheel and sdist in dist/, checked for the package index
+	rm -rf dist build/twine
+	$(BIN)/python -m hatchling build
+	$(PYTHON) -m venv build/twine
+	build/twine/bin/python -m pip install --quiet --disable-pip-version-check "twine>=6.1"
+	build/twine/bin/python -m twine check --strict dist/*
 
 clean:
 	rm -rf .venv runs build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
