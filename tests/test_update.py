@@ -11,7 +11,7 @@ import pytest
 import kreps
 from kreps.algorithms.report import UpdateInfo
 from kreps.algorithms.reps import stationarity_ridge
-from kreps.algorithms.state import LearnerState
+from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.update import update
 from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
@@ -202,3 +202,12 @@ def test_an_update_from_a_data_set_is_of_low_rank_whatever_its_size() -> None:
     assert info.support <= 7
     assert len(after.window.rollouts) == 0
     assert (after.iteration, after.rollouts, after.steps) == (1, 4, 60)
+
+
+def test_a_stage_that_runs_twice_reports_the_sum_of_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter([1.0, 3.0, 4.0, 9.0])
+    monkeypatch.setattr("time.process_time", lambda: next(times))
+    clock = Stopwatch()
+    for stage in ("policy", "dual", "policy"):
+        clock.lap(stage)
+    assert clock.seconds == {"policy": 7.0, "dual": 1.0}

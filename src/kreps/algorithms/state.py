@@ -104,7 +104,7 @@ class UpdateReport(Protocol):
 
 
 class Stopwatch:
-    """CPU seconds between laps, by name."""
+    """CPU seconds between laps, summed by name."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -112,5 +112,5 @@ class Stopwatch:
 
     def lap(self, stage: str) -> None:
         now = time.process_time()
-        self.seconds[stage] = now - self._last
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._last
         self._last = now
