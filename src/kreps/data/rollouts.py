@@ -10,8 +10,9 @@ from typing import Any, overload
 
 import numpy as np
 
-from kreps.data.task import MAX_MAGNITUDE, TaskSpec, is_sane
+from kreps.data.task import TaskSpec
 from kreps.errors import DataError
+from kreps.intake import as_array, as_flags, as_numbers, first_invalid_row, invalid
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -27,10 +28,11 @@ class Rollout:
         actions: (T, da) as the policy commanded them, before clipping.
         rewards: (T,).
         terminated: whether the task ended with the last step.  False if the rollout was only cut
-            off, by a restart or a time limit.
+            off, by a restart or a time limit.  It may be given as a flag for each step, (T,).
 
     Raises:
-        DataError: wrong shapes, no step at all, NaN or infinities.
+        DataError: wrong shapes, no step at all, NaN or infinities, masked values, numbers or flags
+            that are none.
     """
 
     observations: FloatArray
@@ -40,17 +42,12 @@ class Rollout:
 
     def __post_init__(self) -> None:
         for name, dimensions in (("observations", 2), ("actions", 2), ("rewards", 1)):
-            try:
-                values = np.array(getattr(self, name), dtype=np.float64)
-            except (TypeError, ValueError) as error:
-                raise DataError(f"{name} are not an array of numbers: {error}") from error
+            values = as_numbers(name, getattr(self, name), _DROP)
             if values.ndim != dimensions:
                 raise DataError(
                     f"{name} have shape {values.shape}, but {dimensions} dimensions are needed: "
                     "observations (T + 1, ds), actions (T, da), rewards (T,)"
                 )
-            if (row := first_invalid_row(values)) is not None:
-                raise DataError(f"{_INVALID.format(name)} row {row}; {_DROP}")
             object.__setattr__(self, name, _read_only(values))
         steps = len(self.rewards)
         if steps == 0:
@@ -61,7 +58,7 @@ class Rollout:
                 "rewards do not fit together: T rewards need T actions and T + 1 observations "
                 "(the last one is the successor of the last step)"
             )
-        object.__setattr__(self, "terminated", bool(self.terminated))
+        object.__setattr__(self, "terminated", _ended(self.terminated, steps))
 
     @classmethod
     def _view(
@@ -161,15 +158,16 @@ class Rollouts(Sequence[Rollout]):
                 before they are used.
 
         Raises:
-            DataError: sizes that do not fit together, NaN, infinities or absurdly large numbers.
+            DataError: sizes that do not fit together, NaN, infinities or absurdly large numbers,
+                masked values, numbers or flags that are none.
         """
-        # as any array: a memory map stays one
-        observations, actions, rewards = map(np.asanyarray, (observations, actions, rewards))
-        given = np.atleast_1d(lengths)
-        steps = np.where((given >= 1) & (given <= len(rewards)), given, 0).astype(np.intp)
+        observations = as_array("observations", observations)
+        actions, rewards = as_array("actions", actions), as_array("rewards", rewards)
+        given = np.atleast_1d(as_array("lengths", lengths))
+        steps = np.where((given >= 1) & (given <= rewards.size), given, 0).astype(np.intp)
         ended = np.zeros(len(steps), bool)
         if terminated is not None:
-            ended = np.atleast_1d(np.asarray(terminated, bool))
+            ended = np.atleast_1d(as_flags("terminated", terminated))
         fits = (
             (observations.ndim, actions.ndim, rewards.ndim) == (2, 2, 1)
             and steps.ndim == 1
@@ -200,14 +198,14 @@ class Rollouts(Sequence[Rollout]):
             ("actions", self.actions),
             ("rewards", self.rewards),
         ):
-            values = np.array(given, dtype=np.float64)
+            values = np.array(as_array(name, given), dtype=np.float64, subok=False)
             if (row := first_invalid_row(values)) is not None:
                 starts = self.offsets[:-1]
                 if name == "observations":
                     starts = starts + np.arange(len(self))
                 rollout = int(np.searchsorted(starts, row, side="right")) - 1
                 where = f"row {row - starts[rollout]} of rollout {rollout}"
-                raise DataError(f"{_INVALID.format(name)} {where}; {_DROP}")
+                raise DataError(f"{invalid(name)}, first in {where}; {_DROP}")
             arrays.append(_read_only(values))
         points, actions, rewards = arrays
         return Rollouts(points, actions, rewards, self.offsets, self.terminated)
@@ -369,14 +367,21 @@ class Transitions:
         )
 
 
-_INVALID = f"{{}} hold NaN, an infinity or a number beyond {MAX_MAGNITUDE:g}, first in"
 _DROP = "drop the rollout, or cut it before that step"
 
 
-def first_invalid_row(values: FloatArray) -> int | None:
-    """Number of the first row with a value that is NaN, infinite or absurdly large, if any is."""
-    valid = is_sane(values)
-    return None if valid.all() else int(np.argwhere(~valid)[0, 0])
+def _ended(terminated: Any, steps: int) -> bool:
+    """Whether a rollout of so many steps ended with the last, from one flag or one per step."""
+    each = as_flags("terminated", terminated)
+    if each.size == 1:
+        return bool(each.item())
+    if each.shape != (steps,) or each[:-1].any():
+        raise DataError(
+            f"terminated has shape {each.shape} and is true {np.count_nonzero(each)} times, but "
+            f"one flag is needed, or {steps}, of which only the last may be true; cut the rollout "
+            "where the task ended"
+        )
+    return bool(each[-1])
 
 
 def _read_only(values: FloatArray) -> FloatArray:

@@ -7,20 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kreps.errors import ConfigurationError
-from kreps.kernels.arrays import BoolArray, FloatArray
+from kreps.errors import ConfigurationError, DataError
+from kreps.intake import as_array, is_sane
+from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Factor, factors_of
 
 MAX_IMAGE_SIDE = 1024
 """Pixels per side of an image: smoothing costs their square in memory and their cube in time."""
-
-MAX_MAGNITUDE = 1e100
-"""Larger numbers are not accepted as data: products of some of them would overflow."""
-
-
-def is_sane(values: FloatArray) -> BoolArray:
-    """Which ``values`` are neither NaN nor infinite nor beyond `MAX_MAGNITUDE`."""
-    return np.abs(values) <= MAX_MAGNITUDE
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +42,12 @@ class TaskSpec:
     image_shape: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "action_low", np.array(self.action_low, np.float64, ndmin=1))
-        object.__setattr__(self, "action_high", np.array(self.action_high, np.float64, ndmin=1))
+        try:
+            for name in ("action_low", "action_high"):
+                limits = as_array(name, getattr(self, name))
+                object.__setattr__(self, name, np.array(limits, np.float64, ndmin=1))
+        except DataError as error:
+            raise ConfigurationError(str(error)) from error
         try:
             periodic = tuple(sorted({operator.index(i) for i in self.periodic}))
             object.__setattr__(self, "periodic", periodic)

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kreps.envs.batch import BatchModel
-from kreps.kernels.arrays import FloatArray, as_float
+from kreps.errors import DataError
+from kreps.intake import as_numbers
+from kreps.kernels.arrays import FloatArray
 
 
 class BatchEnvironment(gym.Env[FloatArray, FloatArray]):
@@ -39,8 +41,18 @@ class BatchEnvironment(gym.Env[FloatArray, FloatArray]):
         return self._observe(), {}
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        """One control period.
+
+        Raises:
+            DataError: an action of another size, or one that holds NaN or infinities.
+        """
+        values = as_numbers("actions", action, "check what commands it")
+        if values.size != np.prod(self.action_space.shape or ()):
+            raise DataError(
+                f"actions: shape {values.shape}, but {self.action_space.shape} is needed"
+            )
         self._states, rewards, ends = self.batch_model.step(
-            self._states, as_float(action).reshape(1, -1), [self.np_random]
+            self._states, values.reshape(1, -1), [self.np_random]
         )
         return self._observe(), float(rewards[0]), bool(ends[0]), False, {}
 

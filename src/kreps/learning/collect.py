@@ -13,11 +13,12 @@ import gymnasium as gym
 import numpy as np
 
 from kreps.data.rollouts import Rollout, Rollouts
-from kreps.data.task import MAX_MAGNITUDE, TaskSpec, is_sane
+from kreps.data.task import TaskSpec
 from kreps.envs.batch import BatchModel, SettableModel
 from kreps.envs.restart import restart_length, stratified_lengths
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure
-from kreps.kernels.arrays import FloatArray, grid_points
+from kreps.intake import as_array, as_flag, as_flags, as_number, as_numbers
+from kreps.kernels.arrays import BoolArray, FloatArray, grid_points
 from kreps.learning.environment import (
     Environment,
     batch_model_of,
@@ -136,7 +137,7 @@ def collect_grid(
     try:
         simulated = cast(SettableModel, model).states_at(states)
         observations = _checked(model.observe(simulated), count, task).copy()
-        simulated, rewards, ended = model.step(simulated, actions, rngs)
+        simulated, rewards, ended = _step(model, simulated, actions, rngs)
         successors = _checked(model.observe(simulated), count, task)
     except DataError:
         raise
@@ -198,7 +199,7 @@ def _simulate_batch(
     rewards = np.empty((longest, len(ends)))
     t = 0
     try:
-        states = model.initial(rngs)
+        states = np.array(model.initial(rngs))  # a copy, as rows are replaced below
         observations[0] = _checked(model.observe(states), len(ends), task)
         for t in range(longest):
             live = np.flatnonzero(ends > t)
@@ -206,8 +207,9 @@ def _simulate_batch(
                 break
             noise = np.stack([noises[int(j)][t] for j in live])
             actions[t, live] = policy.act(observations[t, live], noise)
-            states[live], rewards[t, live], done = model.step(
-                states[live], task.clip(actions[t, live]), [rngs[int(j)] for j in live]
+            applied = task.clip(actions[t, live])
+            states[live], rewards[t, live], done = _step(
+                model, states[live], applied, [rngs[int(j)] for j in live]
             )
             observations[t + 1, live] = _checked(model.observe(states[live]), len(live), task)
             ends[live[done]] = t + 1
@@ -248,10 +250,11 @@ def _simulate_one(
             state = observations[-1]
             action = policy.act(state[None], noise[len(actions)][None])[0]
             applied = task.clip(action).astype(space.dtype).reshape(space.shape or ())
-            observation, reward, terminated, truncated, _ = env.step(applied)
+            observation, reward, ended, cut, _ = env.step(applied)
             observations.append(_state(observation, task))
             actions.append(action)
-            rewards.append(float(reward))
+            rewards.append(as_number("reward", reward))
+            terminated, truncated = as_flag("terminated", ended), as_flag("truncated", cut)
     except DataError as error:
         where = f"rollout {number} of the environment, after {len(actions)} steps"
         raise DataError(f"{where}: {error}") from error
@@ -270,26 +273,36 @@ def _failure(error: Exception, where: str, steps: int) -> EnvironmentFailure:
     )
 
 
-def _checked(observations: FloatArray, count: int, task: TaskSpec) -> FloatArray:
+def _checked(observations: Any, count: int, task: TaskSpec) -> FloatArray:
     """The observations, if they are of shape (count, ds)."""
-    if np.shape(observations) != (count, task.observation_size):
+    return _of_shape("observations", observations, (count, task.observation_size))
+
+
+def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> FloatArray:
+    found = as_array(name, values)
+    if found.shape != shape:
         raise DataError(
-            f"the batch model returned observations of shape {np.shape(observations)}, but "
-            f"({count}, {task.observation_size}) is needed"
+            f"the batch model returned {name} of shape {found.shape}, but {shape} is needed"
         )
-    return observations
+    return found
+
+
+def _step(
+    model: BatchModel, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """A step of a batch model, if it returns one number and one flag for each row."""
+    successors, rewards, ended = model.step(states, actions, rngs)
+    rows = (len(rngs),)
+    done = as_flags("ends", _of_shape("ends", ended, rows))
+    return successors, _of_shape("rewards", rewards, rows), done
 
 
 def _state(observation: Any, task: TaskSpec) -> FloatArray:
     """An observation as a vector (ds,) of finite numbers."""
-    state = np.array(observation, dtype=np.float64).ravel()
+    state = as_numbers("observations", observation, "repair what measures it").ravel()
     if len(state) != task.observation_size:
         raise DataError(
             f"an observation has {len(state)} coordinates, but the observation space has "
             f"{task.observation_size}"
-        )
-    if not is_sane(state).all():
-        raise DataError(
-            f"an observation holds NaN, an infinity or a number beyond {MAX_MAGNITUDE:g}"
         )
     return state

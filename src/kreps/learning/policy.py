@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from kreps.data.task import MAX_MAGNITUDE, is_sane
 from kreps.errors import ConfigurationError, DataError
+from kreps.intake import as_numbers
 from kreps.kernels.arrays import FloatArray
 from kreps.learning import storage
 from kreps.learning.storage.onnx import write_onnx
@@ -57,19 +57,12 @@ class Policy:
             DataError: another shape, NaN or infinities.
         """
         task = self.process.task
-        try:
-            batch = np.asarray(observation, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise DataError(f"the observation is not an array of numbers: {error}") from error
+        remedy = "no action is defined for it, so check the sensors"
+        batch = as_numbers("observations", observation, remedy)
         if batch.ndim not in (1, 2) or batch.shape[-1] != task.observation_size:
             raise DataError(
                 f"the observation has shape {batch.shape}, but ({task.observation_size},) or "
                 f"(m, {task.observation_size}) is needed; flatten images first"
-            )
-        if not is_sane(batch).all():
-            raise DataError(
-                f"the observation holds NaN, an infinity or a number beyond {MAX_MAGNITUDE:g}, for "
-                "which no action is defined; check the sensors"
             )
         states = np.atleast_2d(batch)
         if deterministic:
