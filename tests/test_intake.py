@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -271,3 +272,49 @@ def test_our_environments_take_actions_of_their_size_only(name: str) -> None:
         with pytest.raises(DataError, match="actions"):
             env.step(action)
     env.step(np.full(size, 1e6))  # commands beyond the limits are clipped
+
+
+# ---- bounds -----------------------------------------------------------------------------------
+
+
+def scaled(state: float, reward: float) -> list[kreps.Rollout]:
+    rng, found = np.random.default_rng(0), []
+    for _ in range(8):
+        a = rng.choice([-1.0, 1.0], 20)
+        x = np.empty(21)
+        x[0] = rng.uniform(-1, 1)
+        for t in range(20):
+            x[t + 1] = np.clip(x[t] + 0.3 * a[t], -5, 5)
+        found.append(kreps.Rollout(state * x[:, None], a[:, None], -reward * x[1:] ** 2))
+    return found
+
+
+SCALES = [(1.0, 1e97), (1e55, 1.0), (1e-55, 1.0), (1.0, 1e-90), (1e90, 1e-90), (1e-90, 1e90)]
+
+
+@pytest.mark.parametrize("learner", [kreps.KREPS, kreps.ValueIteration, kreps.NPALP])
+@pytest.mark.parametrize(("state", "reward"), SCALES)
+def test_what_is_learnt_can_be_saved_and_what_is_saved_be_loaded(
+    learner: Any, state: float, reward: float, tmp_path: Path
+) -> None:
+    made = learner(kreps.TaskSpec(1, [-1.0], [1.0]), seed=0)
+    made.update(scaled(state, reward))
+    made.policy.save(tmp_path / "policy.safetensors")
+    made.save(tmp_path / "checkpoint.safetensors")
+    loaded = kreps.load_policy(tmp_path / "policy.safetensors")
+    resumed = learner.resume(tmp_path / "checkpoint.safetensors")
+    for x in (0.0, state, 1e100):
+        wanted, _ = made.predict([x], deterministic=True)
+        for policy in (loaded, resumed):
+            np.testing.assert_array_equal(policy.predict([x], deterministic=True)[0], wanted)
+
+
+def test_what_could_not_be_saved_is_not_learnt() -> None:
+    learner = kreps.KREPS(kreps.TaskSpec(1, [-1.0], [1.0]), seed=0)
+    learner.update(scaled(1.0, 1.0))
+    before = learner.state
+    other = kreps.KREPS(kreps.TaskSpec(1, [-1.0], [1.0]), seed=0)
+    with pytest.raises(DataError, match=r"lengthscales.*scale observations and rewards"):
+        other.update(scaled(1e-130, 1.0))
+    assert other.state.iteration == 0
+    assert learner.state is before

@@ -669,7 +669,10 @@ def test_a_present_file_that_claims_to_be_old_is_refused(
 def test_one_nan_or_infinity_in_any_array_is_refused(good: Good, tmp_path: Path) -> None:
     tensors = good.tensors
     floats = [name for name, values in tensors.items() if values.dtype == np.float64]
-    for name, value in itertools.product(floats, (np.nan, np.inf, -np.inf, 1.1e100)):
+    data = ("points", "actions", "rewards")  # of the window
+    for name, value in itertools.product(floats, (np.nan, np.inf, -np.inf, 1.1e100, 1.1e200)):
+        if value == 1.1e100 and name not in [f"window.{part}" for part in data]:
+            continue
         if tensors[name].size:
             spoilt = {**tensors, name: tensors[name].copy()}
             spoilt[name].flat[-1] = value
@@ -760,9 +763,9 @@ IMPOSSIBLE: dict[str, dict[str, Callable[[Any], Any]]] = {
     "negative lengthscales": {"policy.kernel.lengthscales": lambda v: -v},
     "no lengthscales": {"policy.kernel.lengthscales": lambda v: 0 * v},
     "tiny lengthscales": {"policy.kernel.lengthscales": lambda v: 1e-320 * v},
-    "huge lengthscales": {"policy.kernel.lengthscales": put(0, 1e60)},
+    "huge lengthscales": {"policy.kernel.lengthscales": put(0, 1e101)},
     "negative lengthscales of V": {"value.kernel.lengthscales": lambda v: -v},
-    "tiny lengthscales of V": {"value.kernel.lengthscales": put(1, 1e-60)},
+    "tiny lengthscales of V": {"value.kernel.lengthscales": put(1, 1e-101)},
     "no samples of a process": none_of("states", "targets", "weights"),
     "no centres of a process": none_of("states", "mean_weights", "explained"),
     "explained variance of other centres": {"policy.explained": lambda v: v[:-1, :-1]},

@@ -266,7 +266,8 @@ class Learner(Generic[MethodSettings]):
             rollouts: at least one; their actions as commanded, before any clipping.
 
         Raises:
-            DataError: no rollout, something that is no rollout, or widths that are not the task's.
+            DataError: no rollout, something that is no rollout, or widths that are not the task's;
+                or numbers so far from one that what is learnt from them could not be saved.
         """
         if isinstance(rollouts, Dataset):
             raise DataError(
@@ -281,7 +282,9 @@ class Learner(Generic[MethodSettings]):
     def _update(self, samples: Any) -> UpdateReport:
         rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
         with blas_threads(self.threads, exact=True):
-            self.state, info = self._updated(samples, rng)
+            state, info = self._updated(samples, rng)
+        storage.require_storable(state)
+        self.state = state
         return info
 
     def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:

@@ -159,7 +159,8 @@ class SparseGP:
         f = self.kernel.embed(states) - origin
         k = centred @ f.T
         k -= half_squares[:, None]
-        k -= 0.5 * np.sum(f * f, axis=1)
+        with np.errstate(over="ignore"):  # infinitely far: then the kernel value is zero
+            k -= 0.5 * np.sum(f * f, axis=1)
         np.minimum(k, 0.0, out=k)
         return np.exp(k, out=k)
 

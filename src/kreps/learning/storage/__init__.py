@@ -4,6 +4,7 @@ from kreps.learning.storage.atomic import write_atomically
 from kreps.learning.storage.checkpoints import (
     POLICIES_OF_METHOD,
     load_checkpoint,
+    require_storable,
     save_checkpoint,
 )
 from kreps.learning.storage.files import MAX_FILE_BYTES, VERSION
@@ -23,6 +24,7 @@ __all__ = [
     "load_checkpoint",
     "load_policy",
     "load_rollouts",
+    "require_storable",
     "rollout_folder",
     "save_checkpoint",
     "save_policy",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ from kreps.algorithms.state import LearnerState
 from kreps.data.rollouts import Rollouts
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
-from kreps.errors import StorageError
+from kreps.errors import DataError, StorageError
 from kreps.kernels.basis import KernelExpansion
 from kreps.kernels.threads import blas_threads
 from kreps.learning.storage.codec import (
@@ -19,6 +20,7 @@ from kreps.learning.storage.codec import (
     Converted,
     Optional,
     Record,
+    StoredArrays,
     Tensors,
     Whole,
 )
@@ -74,6 +76,31 @@ STATE = Record(
 r centres of V, n steps and R rollouts of the window."""
 
 
+def _encoded(state: LearnerState, task: TaskSpec) -> tuple[Any, Tensors]:
+    """Header and arrays of a state, checked as when they are read."""
+    tensors: Tensors = {}
+    header = STATE.encode(state, "", tensors)
+    arrays = StoredArrays.from_memory(tensors)
+    arrays.check([("", STATE, header)], **_sizes(task, header))
+    return header, tensors
+
+
+def _sizes(task: TaskSpec, stored: Mapping[str, Any]) -> dict[str, int]:
+    return task_sizes(task) | ({} if stored["value"] is not None else {"w": 0})
+
+
+def require_storable(state: LearnerState) -> None:
+    """Raise `DataError` if what an update has learnt could not be saved and loaded."""
+    window = state.window
+    try:
+        _encoded(replace(state, window=ReplayWindow(window.task, window.capacity)), window.task)
+    except StorageError as error:
+        raise DataError(
+            f"from these rollouts numbers would be learnt that no file can hold: {error}; scale "
+            "observations and rewards to numbers around one"
+        ) from error
+
+
 def save_checkpoint(
     path: str | Path,
     method: str,
@@ -90,13 +117,13 @@ def save_checkpoint(
     Raises:
         StorageError: the file cannot be written, or would have more than ``max_bytes``.
     """
-    tensors: Tensors = {}
+    stored, tensors = _encoded(state, task)
     header = {
         "method": method,
         "task": TASK.encode(task, "task", tensors),
         "settings": flat(settings),
         "seed": seed,
-        "state": STATE.encode(state, "", tensors),
+        "state": stored,
     }
     write_arrays(path, "checkpoint", tensors, header, max_bytes)
 
@@ -125,9 +152,8 @@ def load_checkpoint(
         Whole().check(header["seed"], "seed", {}, {})
         stored = header["state"]
         _check_presence(stored, method)
-        sizes = task_sizes(task) | ({} if stored["value"] is not None else {"w": 0})
         given = {"task": task, "capacity": settings.window}
-        (state,) = arrays.decode([("", STATE, stored)], given, **sizes)
+        (state,) = arrays.decode([("", STATE, stored)], given, **_sizes(task, stored))
         notes = header.get("notes", [])
     for note in notes:
         warnings.warn(f"{path}: {note}", UserWarning, stacklevel=2)

@@ -19,8 +19,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from kreps.data.task import is_sane
 from kreps.errors import StorageError
+from kreps.intake import MAX_LEARNT, MAX_MAGNITUDE, is_sane
 
 Tensors = dict[str, NDArray[Any]]
 Layout = dict[str, tuple[str, tuple[int, ...]]]
@@ -67,6 +67,7 @@ class Limit:
 POSITIVE = Limit("positive", lambda v: v > 0)
 NOT_NEGATIVE = Limit("at least 0", lambda v: v >= 0)
 FRACTION = Limit("in [0, 1]", lambda v: (v >= 0) & (v <= 1))
+DATA = Limit(f"at most {MAX_MAGNITUDE:g}", is_sane)
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Array:
     Attributes:
         shape: of each axis a letter, a number, or a sum such as ``"n+R"`` of letters that other
             arrays have before it.
-        limit: that every number must keep.  Floats are at most 1e100 in any case.
+        limit: that every number must keep.  Floats are at most 1e200 in any case.
         dtype: one of `NUMBER_TYPES`.
     """
 
@@ -85,9 +86,9 @@ class Array:
     dtype: str = "F64"
 
     def encode(self, value: Any, name: str, tensors: Tensors) -> Any:
-        tensors[name] = np.ascontiguousarray(value, NUMBER_TYPES[self.dtype]).reshape(
-            np.shape(value)
-        )
+        values = np.ascontiguousarray(value, NUMBER_TYPES[self.dtype]).reshape(np.shape(value))
+        self._require(values, name)
+        tensors[name] = values
         return True
 
     def check(self, header: Any, name: str, layout: Layout, sizes: Sizes) -> None:
@@ -111,19 +112,24 @@ class Array:
 
     def decode(self, header: Any, name: str, load: Load, given: Mapping[str, Any]) -> Any:
         values = load(name)
+        self._require(values, name)
+        return values
+
+    def _require(self, values: NDArray[Any], name: str) -> None:
+        """Raise `StorageError` unless all numbers are within their limits.
+
+        These are the same in writing and in reading, so that what is saved can be loaded.
+        """
         if self.dtype == "F64":
             check_sane(name, values)
         if self.limit is not None and not np.all(self.limit.holds(values)):
             raise StorageError(f"array {name!r} holds numbers that are not {self.limit.text}")
-        return values
 
 
 def check_sane(name: str, values: NDArray[np.float64]) -> None:
-    """Raise `StorageError` unless all numbers are finite and at most 1e100."""
-    if not is_sane(values).all():
-        raise StorageError(
-            f"array {name!r} holds NaN, infinities or numbers beyond 1e100: it is damaged"
-        )
+    """Raise `StorageError` unless all numbers are finite and at most 1e200."""
+    if not is_sane(values, MAX_LEARNT).all():
+        raise StorageError(f"array {name!r} holds NaN, infinities or numbers beyond {MAX_LEARNT:g}")
 
 
 def _size(axis: str | int, found: int, sizes: Sizes) -> int:
@@ -336,17 +342,11 @@ class StoredArrays:
         layout = {name: (names[v.dtype], v.shape) for name, v in tensors.items()}
         return cls(layout, tensors.__getitem__)
 
-    def decode(
-        self,
-        nodes: Sequence[tuple[str, Node, Any]],
-        given: Mapping[str, Any],
-        **sizes: int,
-    ) -> list[Any]:
-        """Check and build the values that make up the file.
+    def check(self, nodes: Sequence[tuple[str, Node, Any]], **sizes: int) -> None:
+        """Compare the layout with the schema of the values that make up the file.
 
         Args:
             nodes: name, node and header of each value.
-            given: values that are stored elsewhere.
             **sizes: those that are known before.
 
         Raises:
@@ -357,4 +357,17 @@ class StoredArrays:
             node.check(header, name, left, sizes)
         if left:
             raise StorageError(f"it has an array {min(left)!r:.60} that is of no use in it")
+
+    def decode(
+        self,
+        nodes: Sequence[tuple[str, Node, Any]],
+        given: Mapping[str, Any],
+        **sizes: int,
+    ) -> list[Any]:
+        """`check` the file and build its values, of which ``given`` are stored elsewhere.
+
+        Raises:
+            StorageError: as `check`, or a number out of its range.
+        """
+        self.check(nodes, **sizes)
         return [node.decode(header, name, self.load, given) for name, node, header in nodes]

@@ -47,8 +47,8 @@ TASK = Record(
     },
 )
 
-LENGTHSCALES = Limit("between 1e-50 and 1e50", lambda v: (v > 1e-50) & (v < 1e50))
-TEMPERATURE = Limit("0 or above 1e-50", lambda v: (v == 0) | (v > 1e-50))
+LENGTHSCALES = Limit("between 1e-100 and 1e100", lambda v: (v > 1e-100) & (v < 1e100))
+TEMPERATURE = Limit("0 or above 1e-100", lambda v: (v == 0) | (v > 1e-100))
 
 
 @dataclass(frozen=True)
@@ -172,13 +172,16 @@ def save_policy(policy: LearntPolicy, path: str | Path, max_bytes: int = MAX_FIL
     """Write a policy to a file of at most ``max_bytes``.
 
     Raises:
-        StorageError: another kind of policy, or the file cannot be written.
+        StorageError: another kind of policy, one that could not be loaded, or the file cannot be
+            written.
     """
     tensors: Tensors = {}
     header = {
         "task": TASK.encode(policy.task, "task", tensors),
         "policy": POLICY.encode(policy, "policy", tensors),
     }
+    nodes = [("policy", POLICY, header["policy"])]
+    StoredArrays.from_memory(dict(tensors)).check(nodes, **task_sizes(policy.task))
     write_arrays(path, "policy", tensors, header, max_bytes)
 
 

@@ -12,7 +12,7 @@ from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.errors import DataError, StorageError
 from kreps.learning.storage.atomic import given_path
-from kreps.learning.storage.codec import Array, Converted, Record, Tensors
+from kreps.learning.storage.codec import DATA, Array, Converted, Record, Tensors
 from kreps.learning.storage.files import MAX_FILE_BYTES, reading, write_arrays
 
 
@@ -33,11 +33,11 @@ ROLLOUTS = Converted(
     Record(
         Rollouts,
         {
-            "rewards": Array(("n",)),
+            "rewards": Array(("n",), DATA),
             "terminated": Array(("R",), dtype="BOOL"),
             "offsets": Array(("R+1",), dtype="I64"),
-            "points": Array(("n+R", "ds")),
-            "actions": Array(("n", "da")),
+            "points": Array(("n+R", "ds"), DATA),
+            "actions": Array(("n", "da"), DATA),
         },
     ),
     lambda rollouts: rollouts,
