@@ -219,6 +219,14 @@ def test_a_slice_may_have_a_step() -> None:
         assert_same_rollout(mine, theirs)
 
 
+def test_quartiles_of_the_reward_count_each_rollout_by_its_steps() -> None:
+    rewards = [[-9.0], [-4.0, -2.0, -3.0], [-1.0, 1.0, 0.0, 0.0]]
+    rollouts = [Rollout(np.zeros((len(r) + 1, 2)), np.zeros((len(r), 1)), r) for r in rewards]
+    # means -9, -3 and 0, of which there are one, three and four
+    assert Rollouts.from_list(rollouts).reward_quartiles() == (-3.0, 0.0)
+    assert Rollouts.from_list(rollouts[:1]).reward_quartiles() == (-9.0, -9.0)
+
+
 def test_a_container_is_not_copied() -> None:
     flat = Rollouts.from_list(several())
     assert Rollouts.from_list(flat) is flat

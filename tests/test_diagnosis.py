@@ -70,6 +70,8 @@ HEALTHY: dict[str, Any] = {
     "ridge": 0.02,
     "exploring": 0.0,
     "rejected": 0.0,
+    "reward_lower_quartile": -70.0,
+    "reward_upper_quartile": -50.0,
 }
 
 
@@ -534,13 +536,20 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
     )
     learner: Any = SimpleNamespace(settings=settings_of(**{"value.max_rank": 70}), exploring=True)
     told: Any = SimpleNamespace(
-        iteration=1, rollouts=30, steps=1000, average_reward=-1.0, update=info, rollout_seconds=0.1
+        iteration=1,
+        rollouts=30,
+        steps=1000,
+        average_reward=-1.0,
+        reward_quartiles=(-2.0, -0.5),
+        update=info,
+        rollout_seconds=0.1,
     )
     row = progress_row(learner, told)
     assert set(row) == set(COLUMNS) and row["weighted"] == 4000
     assert row["policy_noise"] == pytest.approx(0.3) and row["max_rank"] == 70
     assert row["clipped"] == 0.25 and row["eta_floor"] == 0.1 and np.isnan(row["model_error"])
     assert row["ridge"] == 0.03 and row["exploring"] == 1.0 and row["rejected"] == 1.0
+    assert (row["reward_lower_quartile"], row["reward_upper_quartile"]) == (-2.0, -0.5)
 
 
 def test_a_goal_that_was_not_reached_is_the_limit() -> None:
@@ -619,6 +628,20 @@ def test_the_reward_is_drawn_with_its_references_and_its_trend() -> None:
     assert set(list(REFERENCES.values())[:-1]) <= levels
     ends = np.asarray(others[-1].get_ydata())
     np.testing.assert_allclose(ends, RISING[6:])
+
+
+def test_one_bad_batch_flattens_no_panel() -> None:
+    rewards, errors = [-123456.0, *RISING[1:]], [*[0.2] * 6, 40.0, *[0.2] * 5]
+    figure, _ = page({"average_reward": rewards, "model_error": errors}, REFERENCES)
+    shown = panels(figure)
+    for start, low, high, value in (
+        ("Average", -150.0, 0.0, "-1.235e+05"),
+        ("Model", 0.0, 1.3, "40"),
+    ):
+        (axes,) = [axes for title, axes in shown.items() if title.startswith(start)]
+        limits = axes.get_ylim()
+        assert low <= limits[0] and limits[1] <= high
+        assert value in [t.get_text() for t in axes.texts]
 
 
 @pytest.mark.parametrize("changes", [{}, BAD], ids=["healthy", "bad"])

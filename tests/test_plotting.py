@@ -29,7 +29,10 @@ from kreps.experiments import plots as experiment_plots
 
 REFERENCES = REFERENCE_REWARDS["kreps/SwingUp-v0"]
 LABELS = Labels(["angle", "velocity"], ["torque"])
-EVALUATION = {"stochastic": {"mean": -30.0}, "greedy": {"mean": -25.0}}
+EVALUATION = {
+    "stochastic": {"mean": -30.0, "standard_error": 1.5},
+    "greedy": {"mean": -25.0, "standard_error": 0.5},
+}
 
 
 def rows(count: int) -> list[dict[str, str]]:
@@ -38,6 +41,8 @@ def rows(count: int) -> list[dict[str, str]]:
             "iteration": str(i + 1),
             "steps": str(100 * (i + 1)),
             "average_reward": str(-90.0 + 10 * i),
+            "reward_lower_quartile": str(-94.0 + 10 * i),
+            "reward_upper_quartile": str(-88.0 + 10 * i),
             "kl": str(0.9 - 0.1 * i),
             "kl_bound": "1.0",
             "effective_samples": str(20.0 + i),
@@ -85,7 +90,9 @@ def test_the_curve_shows_each_batch_at_the_data_its_policy_was_learnt_from() -> 
     np.testing.assert_allclose(middle.lines[0].get_ydata(), [0.9, 0.8, 0.7])
     np.testing.assert_allclose(middle.lines[1].get_ydata(), [1.0, 1.0, 1.0])
     np.testing.assert_allclose(bottom.lines[0].get_ydata(), [0.20, 0.21, 0.22])
-    assert "title" in (top.get_title(loc="left") + top.get_title())
+    assert figure.get_suptitle() == "title"
+    spread = top.collections[0].get_paths()[0].vertices
+    assert {(100.0, -84.0), (100.0, -78.0)} <= set(map(tuple, spread))
 
 
 def test_the_curve_names_every_reference_value_and_the_evaluation() -> None:
@@ -99,11 +106,69 @@ def test_the_curve_names_every_reference_value_and_the_evaluation() -> None:
     at_the_end = {
         float(np.asarray(line.get_ydata())[0])
         for line in top.lines
-        if list(np.asarray(line.get_xdata())) == [300.0]
+        if list(np.asarray(line.get_xdata())) == [300.0] and line.get_marker() in "Ds"
     }
     assert at_the_end == {-30.0, -25.0}
     labels = [t.get_text() for t in top.get_legend().get_texts()]
     assert any("-25" in label and "greedy" in label for label in labels)
+
+
+def drawn(figure: Figure, artist: Any) -> Any:
+    """The box of an artist in pixels."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return artist.get_window_extent(canvas.get_renderer())
+
+
+def test_the_two_evaluations_stand_beside_each_other_with_error_bars() -> None:
+    same = {name: {"mean": -25.0, "standard_error": 1.5} for name in EVALUATION}
+    figure = learning_curve(rows(3), {}, same, "title")
+    top = figure.axes[0]
+    bars = {str(bar.get_label()).split()[0]: bar for bar in top.containers}
+    assert set(bars) == {"stochastic", "greedy"}
+    markers = [bar.lines[0] for bar in bars.values()]
+    assert not drawn(figure, markers[0]).overlaps(drawn(figure, markers[1]))
+    assert markers[0].get_marker() != markers[1].get_marker()
+    assert markers[0].get_color() != markers[1].get_color()
+    for bar in bars.values():
+        (segment,) = bar.lines[2][0].get_segments()
+        np.testing.assert_allclose(sorted(segment[:, 1]), [-28.0, -22.0])  # two standard errors
+    labels = [t.get_text() for t in top.get_legend().get_texts()]
+    assert any("-25 ± 3 (2 s.e.)" in label for label in labels)
+
+
+@pytest.mark.parametrize("references", [{}, REFERENCES])
+@pytest.mark.parametrize("count", [4, 12])
+@pytest.mark.parametrize("bad", [0, 2])
+def test_one_bad_batch_does_not_flatten_the_curve(
+    count: int, bad: int, references: dict[str, float]
+) -> None:
+    content = rows(count)
+    names = ("average_reward", "reward_lower_quartile", "reward_upper_quartile")
+    content[bad] |= dict.fromkeys(names, "-123456")
+    figure = learning_curve(content, references, EVALUATION, "title")
+    top = figure.axes[0]
+    low, high = top.get_ylim()
+    assert low > -140.0 and high < 60.0
+    others = [float(row["average_reward"]) for i, row in enumerate(content) if i != bad]
+    assert low < min(others) and max(others) < high
+    assert "-1.235e+05" in [t.get_text() for t in top.texts]  # its value is at the edge
+    (arrow,) = [line for line in top.lines if line.get_marker() == "v"]
+    assert list(np.asarray(arrow.get_xdata())) == [100.0 * bad]
+
+
+def test_a_curve_without_outliers_is_shown_whole() -> None:
+    figure = learning_curve(rows(12), {}, None, "title")
+    low, high = figure.axes[0].get_ylim()
+    assert low < -94.0 and high > 22.0
+    assert list(figure.axes[0].texts) == []
+
+
+def test_runs_of_earlier_versions_have_a_curve_without_spread() -> None:
+    unknown = {"reward_lower_quartile": "nan", "reward_upper_quartile": "nan"}
+    figure = learning_curve([row | unknown for row in rows(3)], {}, None, "title")
+    assert len(figure.axes[0].collections) == 0
+    np.testing.assert_array_equal(figure.axes[0].lines[0].get_ydata(), [-90.0, -80.0, -70.0])
 
 
 @pytest.mark.parametrize("count", [1, 2])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from kreps.errors import StorageError
+from kreps.kernels.arrays import FloatArray
 
 STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -25,11 +26,14 @@ STYLE: dict[Any, Any] = {
     "legend.frameon": False,
     "savefig.dpi": 150,
 }
-BLUE, ORANGE, GREY = "#20639b", "#d1603d", "#8a8d91"
+BLUE, ORANGE, PURPLE, GREY = "#20639b", "#d1603d", "#8e5ea2", "#8a8d91"
 COLOURS = ("#20639b", "#d1603d", "#c29b19", "#8e5ea2", "#5b6068", "#3caea3")
 """Of the curves of a figure, in their order."""
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)), (0, (7, 2)))
 """Likewise the line styles, which distinguish the curves without their colours."""
+
+OFF_SCALE = 5.0
+"""Few values are left out of an axis if it is shorter by more than this factor without them."""
 
 
 def save(figure: Figure, path: Path) -> Path:
@@ -62,3 +66,58 @@ def draw_references(axes: Axes, references: Mapping[str, float], *, named: bool 
             fontsize=7.5,
         )
         above = value
+
+
+def limits_of_most(
+    values: FloatArray, droppable: int, always: Sequence[float] = ()
+) -> tuple[float, float] | None:
+    """Limits of an axis on which a few values far from the others do not flatten a curve.
+
+    Args:
+        values: (n,) to be shown; NaN are left out.
+        droppable: largest number of them that may lie beyond the limits; at most half do.
+        always: values that must be within.
+
+    Returns:
+        None if all of them fit on one axis.
+    """
+    ordered = np.sort(values[np.isfinite(values)])
+    fixed = [value for value in always if np.isfinite(value)]
+    found, shortest = None, np.inf
+    for dropped in range(min(droppable, len(ordered) // 2) + 1):
+        kept = len(ordered) - dropped
+        spans = [
+            (min([ordered[i], *fixed]), max([ordered[i + kept - 1], *fixed]))
+            for i in range(dropped + 1 if kept else 0)
+        ]
+        low, high = min(spans, key=lambda span: span[1] - span[0], default=(0.0, 0.0))
+        if dropped == 0:
+            shortest = high - low
+        elif 0.0 < OFF_SCALE * (high - low) < shortest:
+            found, shortest = (low, high), high - low
+    if found is None:
+        return None
+    margin = 0.12 * (found[1] - found[0])
+    return found[0] - margin, found[1] + margin
+
+
+def mark_beyond(
+    axes: Axes, x: FloatArray, y: FloatArray, limits: tuple[float, float], colour: str
+) -> None:
+    """Set the limits of the y-axis; an arrow and the value show each point (n,) beyond them."""
+    axes.set_ylim(limits)
+    for beyond, edge, marker, up in ((y < limits[0], 0.0, "v", 1), (y > limits[1], 1.0, "^", -1)):
+        for time, value in zip(x[beyond], y[beyond], strict=True):
+            axes.annotate(
+                f"{value:.4g}",
+                (time, edge),
+                xycoords=("data", "axes fraction"),
+                xytext=(8, 3 * up),
+                textcoords="offset points",
+                va="bottom" if up > 0 else "top",
+                color=colour,
+                fontsize=8,
+                bbox={"boxstyle": "square,pad=0.1", "facecolor": "white", "lw": 0, "alpha": 0.8},
+            )
+            arrow = axes.get_xaxis_transform()
+            axes.plot(time, edge, marker, transform=arrow, color=colour, ms=9, clip_on=False)

@@ -30,7 +30,8 @@ from kreps.app.diagnosis.columns import (
 )
 from kreps.app.diagnosis.trend import reward_trend
 from kreps.errors import ConfigurationError
-from kreps.plotting import BLUE, GREY, STYLE
+from kreps.kernels.arrays import FloatArray
+from kreps.plotting import BLUE, GREY, STYLE, limits_of_most, mark_beyond
 
 COLOURS: dict[Severity, str] = {"limit": "#c0392b", "note": "#b07d10", "fine": "#2a8c7e"}
 PAGES = (".png", ".pdf", ".svg")
@@ -115,14 +116,38 @@ def _mark(axes: Axes, severities: Sequence[Severity]) -> None:
             return
 
 
-def _curve(axes: Axes, rows: Sequence[Row], values: Any, **style: Any) -> None:
+def _curve(axes: Axes, rows: Sequence[Row], values: FloatArray) -> None:
     """Plot values (m,) over the iterations; a remark if all of them are NaN."""
     if np.isfinite(values).any():
-        axes.plot(column(rows, "iteration"), values, "o-", color=BLUE, ms=3, lw=1.2, **style)
+        axes.plot(column(rows, "iteration"), values, "o-", color=BLUE, ms=3, lw=1.2)
     else:
         axes.text(
             0.5, 0.55, "none or not recorded", transform=axes.transAxes, ha="center", color=GREY
         )
+
+
+def _curve_of_most(
+    axes: Axes, rows: Sequence[Row], values: FloatArray, always: Sequence[float]
+) -> FloatArray:
+    """As `_curve`, but a few values far from the others are drawn as arrows at the edge.
+
+    Args:
+        axes: of the panel.
+        rows: m iterations.
+        values: (m,) of them.
+        always: values that the axis contains in any case.
+
+    Returns:
+        The values (m,), moved to the edge where they are beyond it.
+    """
+    limits = limits_of_most(values, 1 + len(rows) // 8, always)
+    if limits is None:
+        _curve(axes, rows, values)
+        return values
+    shown = np.clip(values, *limits)
+    _curve(axes, rows, shown)
+    mark_beyond(axes, column(rows, "iteration"), values, limits, BLUE)
+    return shown
 
 
 def _line(
@@ -165,16 +190,17 @@ def _plain_decades(axes: Axes) -> None:
 
 def _draw_reward(axes: Axes, rows: Sequence[Row], references: Mapping[str, float]) -> None:
     values = column(rows, "average_reward")
-    _curve(axes, rows, values, label="training")
-    for name, value in list(references.items())[:-1]:  # named at the end where the curve is not
-        _line(axes, value, f"{name}  {value:g}", right=value < values.mean())
+    shown = dict(list(references.items())[:-1])
+    axes.margins(y=0.15)
+    _curve_of_most(axes, rows, values, list(shown.values()))
+    for name, value in shown.items():  # named at the end where the curve is not
+        _line(axes, value, f"{name}  {value:g}", right=bool(value < np.median(values)))
     found = reward_trend(rows)
     if found is not None:
         time = column(rows, "iteration")[-found.iterations :]
         line = found.rise * np.linspace(-0.5, 0.5, found.iterations)
         line += np.median(values[-found.iterations :] - line)
         axes.plot(time, line, color="#222222", lw=1.4)
-    axes.margins(y=0.15)
 
 
 def _draw_kl(axes: Axes, rows: Sequence[Row]) -> None:
@@ -213,14 +239,14 @@ def _draw_effective_samples(axes: Axes, rows: Sequence[Row]) -> None:
 
 def _draw_model(axes: Axes, rows: Sequence[Row]) -> None:
     values = column(rows, "model_error")
-    _curve(axes, rows, values)
     note, limit = thresholds.MODEL_ERROR_NOTE, thresholds.MODEL_ERROR_LIMIT
+    shown = _curve_of_most(axes, rows, values, [0.0, 1.0])
+    top = max(1.1, 1.04 * float(np.nanmax(shown, initial=0.0)))
+    axes.set_ylim(0.0, top)
     _line(axes, note, f"note {note:g}", COLOURS["note"], below=True)
     _line(axes, limit, f"limit {limit:g}", COLOURS["limit"])
-    top = max(1.1, 1.1 * float(np.nanmax(values, initial=0.0)))
     _shade(axes, note, limit, "note")
     _shade(axes, limit, top, "limit")
-    axes.set_ylim(0.0, top)
 
 
 def _draw_basis(axes: Axes, rows: Sequence[Row]) -> None:

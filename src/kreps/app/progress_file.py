@@ -3,7 +3,8 @@
 eta, its floor, dual, primal and gap are in standard deviations of the reward.  ``weighted`` is the
 number of samples with a weight in the last step of an update, generated ones included.
 ``policy_noise`` is the policy's standard deviation near its data, in units of half the action
-range.
+range.  The quartiles are those of the new rollouts' mean rewards per step,
+each counted by its steps.
 """
 
 from __future__ import annotations
@@ -48,6 +49,8 @@ ADDED_COLUMNS = (
     "exploring",
     "rejected",
     "cpu_seconds_acceptance_test",
+    "reward_lower_quartile",
+    "reward_upper_quartile",
 )
 """Columns that runs of earlier versions lack, in the order in which they were added.
 
@@ -145,6 +148,7 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
     """The row of an iteration."""
     info, dual = report.update, report.update.dual
     seconds = seconds_by_stage(report)
+    lower, upper = report.reward_quartiles
     return {
         "iteration": report.iteration,
         "rollouts": report.rollouts,
@@ -175,5 +179,7 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "ridge": info.ridge,
         "exploring": float(learner.exploring),
         "rejected": math.nan if info.rejected is None else float(info.rejected),
+        "reward_lower_quartile": lower,
+        "reward_upper_quartile": upper,
         **{seconds_column(stage): round(seconds.get(stage, 0.0), 5) for stage in STAGES},
     }

@@ -278,6 +278,15 @@ class Rollouts(Sequence[Rollout]):
         """(R,) number of steps of each rollout."""
         return np.diff(self.offsets)
 
+    def reward_quartiles(self) -> tuple[float, float]:
+        """Lower and upper quartile of the rollouts' mean rewards per step.
+
+        Each rollout counts by its steps, as in the mean reward of all steps.
+        """
+        means = np.add.reduceat(self.rewards, self.offsets[:-1]) / self.lengths
+        lower, upper = np.quantile(np.repeat(means, self.lengths), (0.25, 0.75))
+        return float(lower), float(upper)
+
     @cached_property
     def transitions(self) -> Transitions:
         """The n transitions; points, actions and rewards are the same arrays."""

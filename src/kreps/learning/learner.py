@@ -49,6 +49,8 @@ class IterationReport:
         iteration: number of updates, this one included.
         rollouts, steps: number of rollouts and environment steps so far.
         average_reward: mean reward per step of the new rollouts.
+        reward_quartiles: lower and upper quartile of the new rollouts' mean rewards per step, in
+            which each rollout counts by its steps, as in the average.
         update: the method's own report of the update, with CPU seconds by stage.
         rollout_seconds: CPU seconds that collecting the new rollouts took.
     """
@@ -57,6 +59,7 @@ class IterationReport:
     rollouts: int
     steps: int
     average_reward: float
+    reward_quartiles: tuple[float, float]
     update: Any
     rollout_seconds: float
 
@@ -252,6 +255,7 @@ class Learner(Generic[MethodSettings]):
                 rollouts=self.state.rollouts,
                 steps=self.state.steps,
                 average_reward=float(rollouts.rewards.mean()),
+                reward_quartiles=rollouts.reward_quartiles(),
                 update=info,
                 rollout_seconds=seconds,
             )
