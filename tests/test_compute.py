@@ -191,6 +191,7 @@ def test_processes_learn_the_same_policy_byte_for_byte(
     assert learnt(given, processes, folder / "there.ckpt") == here
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_learns_the_same_policy(folder: Path) -> None:
     distributed = pytest.importorskip("distributed")
     files = kreps.rollout_folder(folder)

@@ -321,6 +321,7 @@ def test_claims_are_written_from_result_files(tmp_path: Path) -> None:
 # ---- executors --------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_gives_the_same_results(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     trials = [tiny(0), tiny(1)]

@@ -187,6 +187,7 @@ def test_a_checkpoint_is_written_after_every_iteration(tmp_path: Path) -> None:
 # ---- in real processes ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_five_iterations_and_five_more_in_another_process_are_ten(
     tmp_path: Path, ten_in_one_go: Path
 ) -> None:
@@ -199,6 +200,7 @@ def test_five_iterations_and_five_more_in_another_process_are_ten(
     assert_same_run(run, ten_in_one_go, 10)
 
 
+@pytest.mark.slow
 def test_ctrl_c_leaves_a_run_that_can_be_resumed(tmp_path: Path) -> None:
     run = tmp_path / "run"
     process = start(train(run, 1000))
@@ -219,6 +221,7 @@ def test_ctrl_c_leaves_a_run_that_can_be_resumed(tmp_path: Path) -> None:
     assert_same_run(run, untouched.path, total)
 
 
+@pytest.mark.slow
 def test_a_run_killed_at_twenty_random_moments_gives_the_bytes_of_an_untouched_one(
     tmp_path: Path,
 ) -> None:

@@ -229,6 +229,7 @@ def test_hidden_files_are_no_part_of_a_folder(tmp_path: Path) -> None:
 # ---- after a kill -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_killed_writer_leaves_the_old_file_or_the_new_one(tmp_path: Path) -> None:
     path = tmp_path / "x"
     code = (
