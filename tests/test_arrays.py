@@ -44,7 +44,7 @@ from kreps.kernels.kernel import (
     factors_of,
 )
 from kreps.kernels.linalg import cholesky, solve_lower, solve_lower_transposed, with_diagonal
-from kreps.kernels.regression import FeatureRegression, KernelEmbedding, RegressionSums, SampleModel
+from kreps.kernels.regression import FeatureRegression, KernelEmbedding, RegressionSums
 from kreps.learning.collect import collect
 from kreps.policies.exploration import BangBang
 from kreps.policies.sparse_gp import PolicySums
@@ -201,7 +201,6 @@ def test_embeddings_agree(regulariser: float) -> None:
     assert_agree(found, here.expected_features(successors), 1e-10)
     for q in (queries, queries[:1]):
         assert_agree(there.strengths(strict(q)), here.strengths(q), 1e-10)
-    assert_agree(SampleModel().expected_features(strict(successors)), successors)
 
 
 def bases() -> dict[str, Basis]:

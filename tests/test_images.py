@@ -31,7 +31,7 @@ from kreps.kernels.kernel import (
     factors_of,
     median_lengthscales,
 )
-from kreps.kernels.regression import KernelEmbedding, SampleModel
+from kreps.kernels.regression import KernelEmbedding
 from kreps.models.transition import embedding_origin, state_kernel, successor_features
 from kreps.presets import settings_of
 
@@ -296,7 +296,7 @@ def embedding_of(data: Transitions, regulariser: float) -> KernelEmbedding:
 
 
 def expected(
-    data: Transitions, features: FloatArray, model: KernelEmbedding | SampleModel, name: Any
+    data: Transitions, features: FloatArray, model: KernelEmbedding, name: Any
 ) -> FloatArray:
     """Expected features of the successors, with the given hyper-parameters."""
     origin = embedding_origin(features[data.state], name)
@@ -376,7 +376,7 @@ def test_the_change_is_the_sum_of_the_documentation(
 def test_without_regularisation_it_is_the_sample_model(
     data: Transitions, features: FloatArray, name: str
 ) -> None:
-    observed = expected(data, features, SampleModel(), name)
+    observed = successor_features(data, features)
     off = [
         np.abs(expected(data, features, embedding_of(data, regulariser), name) - observed).max()
         for regulariser in (1e-1, 1e-4, 1e-10)
@@ -416,15 +416,6 @@ def test_an_isolated_sample_keeps_a_share_of_its_change() -> None:
         np.testing.assert_allclose(change, own + share * (after - own), atol=1e-9)
         printed = expected(alone, features, model, "embedding")[-1]
         np.testing.assert_allclose(printed, share * after, atol=1e-9)
-
-
-def test_the_sample_model_does_not_depend_on_the_origin(
-    data: Transitions, features: FloatArray
-) -> None:
-    observed = successor_features(data, features)
-    for name in ("sample", "change", "embedding"):
-        found = expected(data, features, SampleModel(), name)
-        np.testing.assert_allclose(found, observed, atol=1e-15 * (1.0 + np.abs(features).max()))
 
 
 def test_after_a_termination_the_change_leads_to_the_start_states(

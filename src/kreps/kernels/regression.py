@@ -170,17 +170,6 @@ class PivotedEmbedding:
 
 
 @dataclass(frozen=True)
-class SampleModel:
-    """The sample-based model: each observed successor in place of the expectation.
-
-    It is Eq. 4 with ``k_sa(i, j) = 1`` if i = j, else 0, and lambda = 0.
-    """
-
-    def expected_features(self, successor_features: Array) -> Array:
-        return successor_features
-
-
-@dataclass(frozen=True)
 class RegressionSums:
     """Sums over samples that determine a linear regression; those of chunks add up.
 
