@@ -77,20 +77,25 @@ def test_an_environment_is_closed_after_an_error(error: BaseException) -> None:
 
 def test_an_environment_that_cannot_be_closed_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Robot, "stuck", OSError("no answer"))
-    with pytest.raises(EnvironmentFailure, match="no answer; check whether it is still powered"):
-        with opened(NAME):
-            pass
-    with pytest.warns(UserWarning, match="still powered"), pytest.raises(KeyboardInterrupt):
-        with opened(NAME):
-            raise KeyboardInterrupt
+    unanswered = pytest.raises(
+        EnvironmentFailure, match="no answer; check whether it is still powered"
+    )
+    with unanswered, opened(NAME):
+        pass
+    with (
+        pytest.warns(UserWarning, match="still powered"),
+        pytest.raises(KeyboardInterrupt),
+        opened(NAME),
+    ):
+        raise KeyboardInterrupt
     assert closed() == [1, 1]
 
 
 def test_an_environment_that_cannot_be_made_is_an_error() -> None:
     for name, arguments in (("missing-v0", {}), (NAME, {"id": 3}), (NAME, {"colour": "red"})):
-        with pytest.raises(ConfigurationError, match=f"cannot make the environment '{name}'"):
-            with opened(name, arguments):
-                pass
+        unmade = pytest.raises(ConfigurationError, match=f"cannot make the environment '{name}'")
+        with unmade, opened(name, arguments):
+            pass
 
 
 @pytest.mark.parametrize("error", [None, RuntimeError("motor"), KeyboardInterrupt()])

@@ -233,7 +233,7 @@ def test_a_new_and_a_resumed_learner_check_the_environment_alike(
         make(checkpoint, kreps.RandomRestart(restarting(0.1), 0.1))
     with pytest.raises(ConfigurationError, match="outermost"):
         make(checkpoint, limited(restarting(0.1)))
-    with pytest.raises(ConfigurationError, match="str, but a single gymnasium.Env"):
+    with pytest.raises(ConfigurationError, match=r"str, but a single gymnasium\.Env"):
         make(checkpoint, SWING_UP)
     with pytest.raises(SpaceError, match="action space"):
         make(checkpoint, gym.make("CartPole-v1"))
@@ -244,7 +244,7 @@ def test_a_new_and_a_resumed_learner_check_the_environment_alike(
 
 def test_resuming_checks_sizes_and_takes_no_task_for_an_environment(checkpoint: Path) -> None:
     task = kreps.KREPS.resume(checkpoint).task
-    with pytest.raises(ConfigurationError, match="TaskSpec, but a single gymnasium.Env"):
+    with pytest.raises(ConfigurationError, match=r"TaskSpec, but a single gymnasium\.Env"):
         resume(checkpoint, task)
     with pytest.raises(ConfigurationError, match="3 observation coordinates"):
         resume(checkpoint, gym.make("Pendulum-v1"))
