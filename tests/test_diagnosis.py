@@ -477,7 +477,7 @@ def test_only_what_may_be_unknown_may_be_nan(
 
 
 def test_new_columns_come_after_those_of_all_versions_before() -> None:
-    # of the last version before policies were judged
+    # of the last version before policies had an acceptance test
     before = [
         "weighted",
         "model_error",
@@ -535,7 +535,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         seconds={},
     )
     learner: Any = SimpleNamespace(settings=settings_of(**{"value.max_rank": 70}), exploring=True)
-    told: Any = SimpleNamespace(
+    iteration: Any = SimpleNamespace(
         iteration=1,
         rollouts=30,
         steps=1000,
@@ -544,7 +544,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         update=info,
         rollout_seconds=0.1,
     )
-    row = progress_row(learner, told)
+    row = progress_row(learner, iteration)
     assert set(row) == set(COLUMNS) and row["weighted"] == 4000
     assert row["policy_noise"] == pytest.approx(0.3) and row["max_rank"] == 70
     assert row["clipped"] == 0.25 and row["eta_floor"] == 0.1 and np.isnan(row["model_error"])

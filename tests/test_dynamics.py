@@ -258,7 +258,7 @@ def test_random_terminations_are_expected_of_every_step() -> None:
     assert share[~data.terminated].mean() == pytest.approx(0.3, abs=0.06)
     after = np.where(data.terminated[:, None], start, observed)
     np.testing.assert_allclose(errors.targets, after - own)
-    # of a chance p: p (1 - p) times the squared distance
+    # of a probability p: p (1 - p) times the squared distance
     wanted = 0.21 * np.mean(np.sum((start - observed) ** 2, axis=1))
     assert errors.mean_square == pytest.approx(wanted, rel=0.15)
 

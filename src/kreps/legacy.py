@@ -82,7 +82,7 @@ def present_settings(given: Mapping[str, Any], preset: str = "model_based") -> d
     elif approximation in ("pivoted", "uniform", "fourier"):
         new["low_rank.above"] = 0
     elif approximation != "auto":
-        new["low_rank"] = approximation  # is refused
+        new["low_rank"] = approximation  # an unknown kind, which is an error later
     if "imagined" in given:
         no_model = {"model_based": None}
         new |= no_model if imagined == 0 else {"model_based.actions_per_state": imagined}

@@ -14,7 +14,7 @@ from kreps.envs.swing_up import MAX_TORQUE, SwingUp, SwingUpBatch
 from kreps.kernels.arrays import BoolArray, FloatArray
 
 PIXELS = 20  # along each side
-EXTENT = 1.2  # m: the camera sees [-EXTENT, EXTENT]^2
+EXTENT = 1.2  # m: the image is of [-EXTENT, EXTENT]^2
 BLUR = 0.3  # m
 ROD = 1.0  # m, as it is drawn
 

@@ -175,7 +175,7 @@ CLAIMS = (
         *(_2B, _on_images(KERNEL), f"{KERNEL}, swing-up", late, Kind.EQUAL),
     ),
     Claim(
-        "Images: kernel REPS ends better than the sample model (shown, not said)",
+        "Images: kernel REPS ends better than the sample model (shown, not stated)",
         *(_2B, _on_images(KERNEL), _on_images(SAMPLE), late),
     ),
 )
