@@ -122,16 +122,7 @@ def collect_grid(
             "allowed (by the window and the cost of an exact update); lower grid_states or "
             "grid_actions"
         )
-    axes = [
-        np.arange(grid_states) * 2.0 * np.pi / grid_states
-        if i in task.periodic
-        else np.linspace(*limits, grid_states)
-        for i, limits in enumerate(observation_limits(env, task, ranges))
-    ]
-    axes += [
-        np.linspace(low, high, grid_actions)
-        for low, high in zip(task.action_low, task.action_high, strict=True)
-    ]
+    axes = grid_axes(task, observation_limits(env, task, ranges), grid_states, grid_actions)
     states, actions = np.split(grid_points(axes), [task.observation_size], axis=1)
     rngs = [generator(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
     try:
@@ -145,6 +136,31 @@ def collect_grid(
         raise _failure(error, "a step from a grid of states", 0) from error
     points = np.stack([observations, successors], axis=1).reshape(2 * count, -1)
     return Rollouts.from_arrays(points, actions, rewards, np.ones(count), ended)
+
+
+def grid_axes(
+    task: TaskSpec,
+    limits: Sequence[tuple[float, float]],
+    grid_states: int,
+    grid_actions: int,
+) -> list[FloatArray]:
+    """The grid's values of each state and action coordinate, ``ds + da`` arrays.
+
+    Args:
+        task: limits of the actions, and which coordinates are angles.
+        limits: smallest and largest value of each observation coordinate.
+        grid_states, grid_actions: points per coordinate.  Angles are spaced over a whole turn.
+    """
+    turn = np.arange(grid_states) * 2.0 * np.pi / grid_states
+    states = [
+        turn if i in task.periodic else np.linspace(low, high, grid_states)
+        for i, (low, high) in enumerate(limits)
+    ]
+    actions = [
+        np.linspace(low, high, grid_actions)
+        for low, high in zip(task.action_low, task.action_high, strict=True)
+    ]
+    return states + actions
 
 
 def simulate(
