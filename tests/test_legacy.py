@@ -297,7 +297,7 @@ def put(where: int, value: float) -> Callable[[Any], Any]:
 
 IMPOSSIBLE: dict[str, dict[str, Callable[[Any], Any]]] = {
     "lengthscales": {"policy.lengthscales": lambda v: -v},
-    "lengthscales of V": {"value.lengthscales": put(0, 1e-60)},
+    "lengthscales of V": {"value.lengthscales": put(0, 1e-101)},
     "weights": {"policy.weights": put(0, 0.0)},
     "signal": {"policy.signal_and_noise": put(0, 0.0)},
     "noise": {"policy.signal_and_noise": put(1, -1.0)},
