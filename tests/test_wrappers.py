@@ -249,7 +249,7 @@ def test_resuming_checks_sizes_and_takes_no_task_for_an_environment(checkpoint: 
     with pytest.raises(ConfigurationError, match="3 observation coordinates"):
         resume(checkpoint, gym.make("Pendulum-v1"))
     stronger = replace(task, action_high=np.array([31.0]))
-    with pytest.raises(ConfigurationError, match="resume in the environment"):
+    with pytest.raises(ConfigurationError, match="environment of the checkpoint"):
         environment_for(gym.make(SWING_UP), stronger, 0.1)
 
 

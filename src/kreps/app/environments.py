@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from typing import Any, NamedTuple
-
-import gymnasium as gym
 
 from kreps.app.run_folder import RunConfig
 from kreps.data.task import TaskSpec
 from kreps.envs.references import REFERENCE_RESTART_PROBABILITY, REFERENCE_REWARDS
-from kreps.errors import ConfigurationError
-from kreps.learning.environment import Environment
+from kreps.learning.environment import opened
+from kreps.learning.wrappers import Environment, Wrapper, keeps_actions, keeps_observations
+from kreps.learning.wrappers import metadata_of as usable_metadata
 from kreps.settings import LearnerSettings
 
 
@@ -22,19 +22,14 @@ class Labels(NamedTuple):
     actions: list[str]
 
 
-def make_environment(environment: str, **options: Any) -> Environment:
-    """The environment of a Gymnasium name; ``module:name`` imports the module first.
+def environment_of(config: RunConfig, **options: Any) -> AbstractContextManager[Environment]:
+    """A new environment of a run, which is closed at the end in any case (`opened`).
 
-    Raises:
-        ConfigurationError: it cannot be made.
+    Args:
+        config: of the run.
+        options: of ``gymnasium.make``, beside those of the run.
     """
-    try:
-        return gym.make(environment, **options)
-    except Exception as error:  # whatever a foreign environment raises
-        raise ConfigurationError(
-            f"cannot make the environment {environment!r}: {error}; check its name, "
-            "or write module:name to have its module imported first"
-        ) from error
+    return opened(config.environment, {**config.arguments, **options})
 
 
 def metadata_of(env: Environment) -> Mapping[str, Any]:
@@ -46,24 +41,29 @@ def metadata_of(env: Environment) -> Mapping[str, Any]:
 def labels_of(env: Environment, task: TaskSpec) -> Labels:
     """Labels from the environment's metadata, or numbered ones where those are not usable.
 
-    A dollar sign is escaped, as Matplotlib would read mathematics between two of them.
+    They are not usable if a wrapper may change what they are about.  A dollar sign is escaped, as
+    Matplotlib would read mathematics between two of them.
     """
-    metadata = metadata_of(env)
 
-    def labels(kind: str, count: int) -> list[str]:
-        given = metadata.get(f"{kind}_labels")
+    def labels(kind: str, count: int, keeps: Callable[[Wrapper], bool]) -> list[str]:
+        given = usable_metadata(env, keeps)[0].get(f"{kind}_labels")
         if not isinstance(given, list | tuple) or len(given) != count:
             return [f"{kind} {i}" for i in range(count)]
         return [str(label).replace("$", r"\$") for label in given]
 
-    return Labels(labels("observation", task.observation_size), labels("action", task.action_size))
+    return Labels(
+        labels("observation", task.observation_size, keeps_observations),
+        labels("action", task.action_size, keeps_actions),
+    )
 
 
 def references_of(config: RunConfig) -> dict[str, float]:
     """Reference rewards of a run's task by name, from best to worst.
 
-    Empty where none are known for the task at the run's restart probability.
+    Empty where none are known for the task with the run's arguments and restart probability.
     """
+    if config.arguments:
+        return {}
     # only this setting is read: a run of an earlier version may have unknown ones
     default = LearnerSettings.restart_probability
     if config.settings.get("restart_probability", default) != REFERENCE_RESTART_PROBABILITY:

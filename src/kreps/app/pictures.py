@@ -11,16 +11,18 @@ from pathlib import Path
 from kreps.app.console import console
 from kreps.app.diagnosis import Finding
 from kreps.app.environments import (
+    environment_of,
     labels_of,
-    make_environment,
     metadata_of,
     references_of,
 )
 from kreps.app.recording import record
 from kreps.app.run_folder import RunFolder
 from kreps.errors import ConfigurationError
+from kreps.learning.environment import environment_for
 from kreps.learning.methods import KREPS
 from kreps.learning.policy import Policy
+from kreps.learning.wrappers import Environment
 
 
 def draw_run(folder: RunFolder, learner: KREPS) -> list[Path]:
@@ -59,15 +61,16 @@ def film_run(
 
     Args:
         folder: of the run.
-        learner: with at least one update.
+        learner: with at least one update.  Its own environment, if it has one, is not used and
+            should be closed: the two may be the same robot.
         steps: largest length of the rollout.
         stochastic: whether the policy acts with its exploration noise.
         seed: of the rollout.
         out: a ``.gif`` file; ``video.gif`` in the run if None.
 
     Raises:
-        ConfigurationError: ``out`` does not end in ``.gif``, or the environment cannot be made or
-            has no pictures among its render modes.
+        ConfigurationError: ``out`` does not end in ``.gif``, or the environment cannot be made, is
+            not that of the learner, or has no pictures among its render modes.
         EnvironmentFailure: the environment raised, or returned no picture.
         StorageError: the film cannot be written.
     """
@@ -75,24 +78,21 @@ def film_run(
 
     path = out or folder.path / "video.gif"
     check_film_name(path)
-    _require_pictures(learner)
-    env = make_environment(folder.config().environment, render_mode="rgb_array")
-    policy = Policy(learner.policy.process, seed)
+    if learner.env is not None:
+        _require_pictures(learner.env)  # so that no other one is made in vain
+    policy, task = Policy(learner.policy.process, seed), learner.task
     with console.status("filming ..."):
-        try:
-            recording = record(env, policy, steps, seed, deterministic=not stochastic)
-        finally:
-            env.close()
-        return film(recording, learner.state, learner.task, labels_of(env, learner.task), path)
+        with environment_of(folder.config(), render_mode="rgb_array") as env:
+            _require_pictures(env)
+            inside = environment_for(env, task, learner.settings.restart_probability)
+            recording = record(inside, policy, steps, seed, deterministic=not stochastic)
+            labels = labels_of(inside, task)
+        return film(recording, learner.state, task, labels, path)
 
 
-def _require_pictures(learner: KREPS) -> None:
-    """Raise `ConfigurationError` if the environment names its render modes and none are arrays.
-
-    Then it need not be made a second time.
-    """
-    assert learner.env is not None
-    modes = metadata_of(learner.env).get("render_modes")
+def _require_pictures(env: Environment) -> None:
+    """Raise `ConfigurationError` if the environment names its render modes and none are arrays."""
+    modes = metadata_of(env).get("render_modes")
     if isinstance(modes, list | tuple) and modes and "rgb_array" not in modes:
         raise ConfigurationError(
             f"the environment draws no pictures: its render_modes are {modes}, and a film needs "

@@ -26,14 +26,24 @@ SHOWN_FINDINGS = 3
 """Findings printed at the end of a run; `kreps diagnose` prints all."""
 
 
-def report_run(folder: RunFolder, learner: KREPS) -> None:
-    """Evaluate the policy, draw the pictures, and print a summary with the main findings."""
+def evaluate_at_end(folder: RunFolder, learner: KREPS) -> dict[str, Evaluation]:
+    """Evaluate the policy at the end of its training, in the environment it was learnt in."""
     assert learner.env is not None
     episodes, steps = EPISODES, STEPS
     if batch_model_of(learner.env) is None:
         episodes, steps = SHORT_EVALUATION
         say(f"a short evaluation; `kreps evaluate {folder.path}` makes a full one")
-    evaluation = evaluate_run(folder, learner, episodes, steps, seed=0)
+    return evaluate_run(folder, learner, episodes, steps, seed=0)
+
+
+def report_run(folder: RunFolder, learner: KREPS, evaluation: Mapping[str, Evaluation]) -> None:
+    """Draw the pictures, and print a summary with the main findings.
+
+    Args:
+        folder: of the run.
+        learner: its environment should be closed already, as another one is made for the film.
+        evaluation: of its policy.
+    """
     pictures = draw_run(folder, learner)
     try:
         pictures.append(film_run(folder, learner))

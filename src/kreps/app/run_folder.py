@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ class RunConfig:
         seed, preset, settings: as given to `KREPS`; ``settings`` holds only what was changed, by
             flat names such as ``"value.max_rank"``.
         periodic: as given to `KREPS`.
+        arguments: of the environment, as given to ``gymnasium.make``.
     """
 
     environment: str
@@ -41,6 +42,7 @@ class RunConfig:
     preset: str
     settings: dict[str, Any]
     periodic: list[int] | None
+    arguments: dict[str, Any] = field(default_factory=dict)
 
 
 class RunFolder:
@@ -91,7 +93,8 @@ class RunFolder:
                 content["settings"] = present_settings(content["settings"], recipe)
                 content["preset"] = present_preset(recipe)
             config = RunConfig(**content)
-            types = {"environment": str, "iterations": int, "seed": int, "settings": dict}
+            types = {"environment": str, "iterations": int, "seed": int}
+            types |= {"settings": dict, "arguments": dict}
             for name, kind in types.items():
                 if not isinstance(getattr(config, name), kind):
                     raise TypeError(f"{name} is not a {kind.__name__}")

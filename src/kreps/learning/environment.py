@@ -13,7 +13,7 @@ import numpy as np
 
 from kreps.data.task import TaskSpec
 from kreps.envs.batch import BatchModel
-from kreps.errors import ConfigurationError, EnvironmentFailure, SpaceError
+from kreps.errors import ConfigurationError, SpaceError
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.wrappers import Environment as Environment
 from kreps.learning.wrappers import (
@@ -35,7 +35,8 @@ ANGLES, GROUPS, IMAGE_SHAPE = (
 def opened(name: str, arguments: Mapping[str, Any] | None = None) -> Iterator[Environment]:
     """A new environment, which is closed at the end, after an error, and after Ctrl-C.
 
-    Every environment that kreps makes is made here: that of a robot must not stay powered.
+    Every environment that kreps makes is made here: that of a robot must not stay powered.  If it
+    cannot be closed there is a `UserWarning`.
 
     Args:
         name: Gymnasium name; ``module:name`` imports the module first.
@@ -43,7 +44,6 @@ def opened(name: str, arguments: Mapping[str, Any] | None = None) -> Iterator[En
 
     Raises:
         ConfigurationError: it cannot be made.
-        EnvironmentFailure: it cannot be closed; a `UserWarning` if there is another error already.
     """
     try:
         env: Environment = gym.make(name, **(arguments or {}))
@@ -54,23 +54,16 @@ def opened(name: str, arguments: Mapping[str, Any] | None = None) -> Iterator[En
         ) from error
     try:
         yield env
-    except BaseException:
+    finally:
         try:
             env.close()
-        except Exception as error:
-            warnings.warn(_not_closed(name, error), UserWarning, stacklevel=3)
-        raise
-    try:
-        env.close()
-    except Exception as error:
-        raise EnvironmentFailure(_not_closed(name, error)) from error
-
-
-def _not_closed(name: str, error: Exception) -> str:
-    return (
-        f"close() of the environment {name!r} raised {type(error).__name__}: {error}; check "
-        "whether it is still powered"
-    )
+        except Exception as error:  # what was learnt and what went wrong before must not be hidden
+            warnings.warn(
+                f"close() of the environment {name!r} raised {type(error).__name__}: {error}; "
+                "check whether it is still powered",
+                UserWarning,
+                stacklevel=3,
+            )
 
 
 def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec:
@@ -173,7 +166,7 @@ def environment_for(env: Environment, task: TaskSpec, restart_probability: float
         raise ConfigurationError(
             f"the environment has {size} observation coordinates and actions in {low} to {high}, "
             f"the learner {task.observation_size} and {task.action_low} to {task.action_high}; "
-            "resume in the environment that it was learnt in"
+            "give the environment of the checkpoint"
         )
     inside, probability = without_restarts(env)
     if probability is not None and probability != restart_probability:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sized
+from collections.abc import Callable, Iterator, Mapping, Sized
 from typing import Any
 
 import gymnasium as gym
@@ -107,12 +107,12 @@ def metadata_of(
 
 
 def _take(
-    metadata: dict[str, Any] | None,
+    metadata: Any,
     held: dict[str, Any],
     left_out: dict[str, list[str]],
     changing: list[str],
 ) -> None:
-    for key, value in (metadata or {}).items():
+    for key, value in metadata.items() if isinstance(metadata, Mapping) else ():
         if key in held or key in left_out:
             continue
         empty = value is None or (isinstance(value, Sized) and len(value) == 0)

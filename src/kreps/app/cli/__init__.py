@@ -5,6 +5,7 @@ Each module has the commands of one purpose; this one assembles them.
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Callable, Sequence
 from inspect import getdoc
@@ -69,7 +70,17 @@ _add(search, SEARCH_EXAMPLES)
 
 
 def main() -> None:
-    """Run the command line; an error of the library is printed as one line, not as a traceback."""
+    """Run the command line; an error of the library is printed as one line, not as a traceback.
+
+    Modules of environments are found in the current folder, too, as with ``python -m kreps``.  A
+    terminal that is closed, or ``kill``, ends the program as Ctrl-C does: environments are closed.
+    """
+    if "" not in sys.path:
+        sys.path.append("")
+    for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP, and nohup ignores it
+        number = getattr(signal, name, None)
+        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
+            signal.signal(number, signal.default_int_handler)
     try:
         sys.exit(app(standalone_mode=False))  # a command's typer.Exit is returned as its code
     except KrepsError as error:

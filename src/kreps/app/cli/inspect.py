@@ -7,13 +7,14 @@ from typing import Annotated
 
 import typer
 
-from kreps.app.cli.runs import RunArgument, learnt
+from kreps.app.cli.runs import RunArgument, learnt, require_checkpoint
 from kreps.app.console import say
 from kreps.app.evaluation import evaluate_run
 from kreps.app.pictures import draw_diagnosis, draw_run, film_run
 from kreps.app.report import say_diagnosis
 from kreps.app.run_folder import RunFolder
 from kreps.learning.evaluate import EPISODES, STEPS
+from kreps.learning.methods import KREPS
 
 EVALUATE_EXAMPLES = ("kreps evaluate runs/swing-up --episodes 200 --steps 400",)
 PLOT_EXAMPLES = ("kreps plot runs/swing-up",)
@@ -35,13 +36,16 @@ def evaluate(
 ) -> None:
     """Measure the average reward per step of the policy, with and without exploration noise."""
     folder = RunFolder(run)
-    evaluate_run(folder, learnt(folder), episodes, steps, seed)
+    with learnt(folder) as learner:
+        evaluate_run(folder, learner, episodes, steps, seed)
 
 
 def plot(run: RunArgument) -> None:
     """Draw the learning curve and, for two-dimensional states, maps of the policy and of V."""
     folder = RunFolder(run)
-    for path in draw_run(folder, learnt(folder)):
+    with learnt(folder) as learner:
+        drawn = draw_run(folder, learner)
+    for path in drawn:
         say(f"drew {path}")
 
 
@@ -81,5 +85,7 @@ def video(
 ) -> None:
     """Film the policy in its environment."""
     folder = RunFolder(run)
-    path = film_run(folder, learnt(folder), steps, stochastic=stochastic, seed=seed, out=out)
+    require_checkpoint(folder)
+    learner = KREPS.resume(folder.checkpoint_file)
+    path = film_run(folder, learner, steps, stochastic=stochastic, seed=seed, out=out)
     say(f"filmed {path}")

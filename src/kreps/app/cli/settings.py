@@ -20,8 +20,8 @@ from kreps.settings import LearnerSettings, Settings
 SETTINGS_EXAMPLES = ("kreps settings", "kreps settings --preset paper")
 
 
-def parse_setting(text: str) -> tuple[str, Any]:
-    """Name and value of ``NAME=VALUE``.
+def parse_setting(text: str, option: str = "--set") -> tuple[str, Any]:
+    """Name and value of ``NAME=VALUE``, given by an option of the command line.
 
     The value is read as JSON if it is valid JSON, ``none`` as None, and all else as a string.
 
@@ -30,7 +30,8 @@ def parse_setting(text: str) -> tuple[str, Any]:
     """
     name, equals, value = text.partition("=")
     if not equals:
-        raise ConfigurationError(f"--set {text!r} is not NAME=VALUE, such as kl_bound=0.5")
+        example = "kl_bound=0.5" if option == "--set" else "speed=0.5"
+        raise ConfigurationError(f"{option} {text!r} is not NAME=VALUE, such as {example}")
     if value.lower() == "none":
         return name, None
     try:

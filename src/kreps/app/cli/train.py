@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -11,11 +12,12 @@ import typer
 from kreps.app.cli.runs import RunArgument
 from kreps.app.cli.settings import parse_setting
 from kreps.app.console import say
-from kreps.app.environments import make_environment
-from kreps.app.report import report_run
+from kreps.app.environments import environment_of
+from kreps.app.report import evaluate_at_end, report_run
 from kreps.app.run_folder import RunConfig, RunFolder
 from kreps.errors import ConfigurationError, EnvironmentFailure
 from kreps.learning.environment import Environment
+from kreps.learning.evaluate import Evaluation
 from kreps.learning.methods import KREPS
 from kreps.legacy import present_preset
 from kreps.presets import PRESETS, settings_of
@@ -28,6 +30,7 @@ TRAIN_EXAMPLES = (
     "kreps train kreps/ImageSwingUp-v0 --iterations 15 --out runs/images",
     "kreps train Pendulum-v1 --set kl_bound=0.5 --set window=60 --out runs/pendulum",
     "kreps train my_robot.envs:Arm-v0 --periodic 0 --periodic 1 --out runs/arm",
+    "kreps train my_robot.envs:Arm-v0 --env-arg port=/dev/ttyUSB0 --out runs/arm",
 )
 
 RESUME_EXAMPLES = ("kreps resume runs/swing-up", "kreps resume runs/swing-up --iterations 40")
@@ -37,7 +40,11 @@ ReportOption = Annotated[bool, typer.Option(help="Evaluate and draw pictures at 
 
 def train(
     environment: Annotated[
-        str, typer.Argument(help="Gymnasium name, or module:name to import the module first.")
+        str,
+        typer.Argument(
+            help="Gymnasium name, or module:name to import the module first, which may lie in the "
+            "current folder."
+        ),
     ],
     out: Annotated[Path, typer.Option(help="Folder for the run; must not hold one yet.")],
     iterations: Annotated[int, typer.Option(min=1, help="Policy updates to make.")] = 20,
@@ -54,6 +61,13 @@ def train(
         list[str],
         typer.Option("--set", metavar="NAME=VALUE", help="Change one setting; may be repeated."),
     ] = [],  # noqa: B006 (typer reads the default)
+    env_arg: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="An argument of the environment, as for gymnasium.make; may be repeated.",
+        ),
+    ] = [],  # noqa: B006
     periodic: Annotated[
         list[int],
         typer.Option(help="An observation coordinate that is an angle; may be repeated."),
@@ -76,12 +90,14 @@ def train(
         preset=preset,
         settings=dict(parse_setting(text) for text in set_),
         periodic=periodic or None,
+        arguments=dict(parse_setting(text, "--env-arg") for text in env_arg),
     )
-    env = make_environment(environment)
-    learner = _learner(config, env)  # settings are checked before a folder is made
     folder = RunFolder(out)
-    folder.create(config)
-    _learn(folder, learner, iterations, report)
+    with environment_of(config) as env:
+        learner = _learner(config, env)  # settings are checked before a folder is made
+        folder.create(config)
+        evaluation = _learn(folder, learner, iterations, report)
+    _finish(folder, learner, evaluation)
 
 
 def resume(
@@ -94,17 +110,18 @@ def resume(
     """Continue a run from its last update; the result is that of an uninterrupted run."""
     folder = RunFolder(run)
     config = folder.config()
-    env = make_environment(config.environment)
-    if folder.checkpoint_file.exists():
-        learner = KREPS.resume(folder.checkpoint_file, env)
-    else:  # stopped before the first update
-        learner = _learner(config, env)
-    if iterations is not None:  # stored, so that resuming after another stop needs no option
-        config = replace(config, iterations=iterations)
-        folder.write_config(config)
-    done = learner.state.iteration
-    say(f"{run}: {done} updates made, {max(config.iterations - done, 0)} to go")
-    _learn(folder, learner, config.iterations, report)
+    with environment_of(config) as env:
+        if folder.checkpoint_file.exists():
+            learner = KREPS.resume(folder.checkpoint_file, env)
+        else:  # stopped before the first update
+            learner = _learner(config, env)
+        if iterations is not None:  # stored, so that resuming after another stop needs no option
+            config = replace(config, iterations=iterations)
+            folder.write_config(config)
+        done = learner.state.iteration
+        say(f"{run}: {done} updates made, {max(config.iterations - done, 0)} to go")
+        evaluation = _learn(folder, learner, config.iterations, report)
+    _finish(folder, learner, evaluation)
 
 
 def _learner(config: RunConfig, env: Environment) -> KREPS:
@@ -118,7 +135,10 @@ def _learner(config: RunConfig, env: Environment) -> KREPS:
     )
 
 
-def _learn(folder: RunFolder, learner: KREPS, target: int, report: bool) -> None:
+def _learn(
+    folder: RunFolder, learner: KREPS, target: int, report: bool
+) -> dict[str, Evaluation] | None:
+    """Make the updates that are missing; the evaluation of the policy for a report."""
     left = target - learner.state.iteration
     folder.rows()  # a damaged file is an error now, not after the first update
     try:
@@ -133,7 +153,12 @@ def _learn(folder: RunFolder, learner: KREPS, target: int, report: bool) -> None
     except EnvironmentFailure:
         say(f"after repairing the environment, continue with: kreps resume {folder.path}")
         raise
-    if report:
-        report_run(folder, learner)
-    else:
+    return evaluate_at_end(folder, learner) if report else None
+
+
+def _finish(folder: RunFolder, learner: KREPS, evaluation: Mapping[str, Evaluation] | None) -> None:
+    """Report a run whose environment is closed."""
+    if evaluation is None:
         say(f"policy: {folder.policy_file}")
+    else:
+        report_run(folder, learner, evaluation)
