@@ -11,15 +11,16 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from PIL import Image
 
 import kreps
 from kreps import plotting
 from kreps.app.environments import Labels
-from kreps.app.plots.film import Recording
+from kreps.app.plots.film import Gauge, PolicyPanel, Recording
 from kreps.app.plots.film import film as draw_film
 from kreps.app.plots.learning_curve import learning_curve
-from kreps.app.plots.plane import path_of
+from kreps.app.plots.plane import opacity, path_of, state_grid
 from kreps.app.plots.policy_maps import policy_maps
 from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
@@ -233,6 +234,73 @@ def test_the_maps_show_policy_and_value_over_the_plane(learnt: kreps.KREPS, tmp_
     assert plotting.save(figure, tmp_path / "maps.png").stat().st_size > 10_000
 
 
+def marked(axes: Any, label: str) -> Any:
+    """The points (m, 2) of the line with a label."""
+    (line,) = [line for line in axes.lines if line.get_label() == label]
+    return np.asarray(line.get_xydata())
+
+
+def test_the_maps_mark_starts_and_the_highest_reward(learnt: kreps.KREPS) -> None:
+    window = learnt.state.window
+    best = int(np.argmax(window.rollouts.rewards))
+    figure = maps(learnt)
+    for axes in figure.axes[:3]:
+        np.testing.assert_array_equal(marked(axes, "start"), [[np.pi, 0.0]] * len(window.rollouts))
+        goal = window.transitions.points[window.transitions.successor[best]]
+        np.testing.assert_array_equal(marked(axes, "highest reward observed"), [goal])
+    names = [t.get_text() for t in figure.legends[0].get_texts()]
+    assert names == ["latest rollouts", "start", "highest reward observed", "faded: no data"]
+
+
+def test_no_goal_is_marked_while_no_reward_depends_on_the_state() -> None:
+    rng = np.random.default_rng(0)
+    learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]))
+    actions = rng.normal(size=(29, 1))
+    learner.update(
+        [Rollout(rng.normal(size=(30, 2)), actions, -(np.clip(actions[:, 0], -1, 1) ** 2))]
+    )
+    labels = {str(line.get_label()) for axes in maps(learner).axes[:3] for line in axes.lines}
+    assert "start" in labels and "highest reward observed" not in labels
+
+
+def test_the_maps_fade_where_there_are_no_data() -> None:
+    rng = np.random.default_rng(0)
+    task = TaskSpec(2, [-1.0], [1.0], (0,))
+    observations = np.stack([rng.uniform(-3.1, -2.0, 60), np.linspace(-1.0, 1.0, 60)], axis=1)
+    learner = kreps.KREPS(task)
+    learner.update([Rollout(observations, rng.normal(size=(59, 1)), rng.normal(size=59))])
+    x, y, states = state_grid(learner.state, task)
+    visible = opacity(x, y, states, learner.state, task).ravel()
+    assert visible.max() == 1.0 and visible.min() == pytest.approx(0.15)
+    length = np.array([2.0 * np.pi, y[-1] - y[0]])
+    offsets = np.abs(states[:, None] - observations)
+    offsets[..., 0] = np.minimum(offsets[..., 0], 2.0 * np.pi - offsets[..., 0])
+    distance = np.sqrt(np.sum((offsets / length) ** 2, axis=2)).min(axis=1)
+    assert (visible[distance < 0.039] == 1.0).all()
+    np.testing.assert_allclose(visible[distance > 0.121], 0.15)
+    figure = maps(learner)
+    for axes in figure.axes[:3]:
+        np.testing.assert_allclose(np.ravel(axes.images[0].get_alpha()), visible)
+
+
+def test_the_colours_of_v_are_those_of_the_data(learnt: kreps.KREPS) -> None:
+    axes = maps(learnt).axes[2]
+    low, high = axes.images[0].get_clim()
+    values = learnt.value_function(learnt.state.window.transitions.points)
+    assert low <= values.min() + 1e-6 * abs(low) + 0.05 * np.ptp(values)
+    assert high >= values.max() - 0.05 * np.ptp(values)
+    shown = np.asarray(axes.images[0].get_array())[np.asarray(axes.images[0].get_alpha()) == 1.0]
+    assert (low, high) == (shown.min(), shown.max())
+
+
+@pytest.mark.parametrize("make", ["curve", "maps"])
+def test_text_is_readable_at_the_width_of_a_page(make: str, learnt: kreps.KREPS) -> None:
+    figure = maps(learnt) if make == "maps" else learning_curve(rows(3), REFERENCES, EVALUATION, "")
+    pixels_per_inch = 830.0 / figure.get_size_inches()[0]  # the README is 830 pixels wide
+    sizes = [t.get_fontsize() for t in figure.findobj(Text) if t.get_text() and t.get_visible()]
+    assert min(sizes) / 72.0 * pixels_per_inch > 9.5
+
+
 def test_the_maps_draw_the_latest_rollouts_without_lines_across_the_cut() -> None:
     task = TaskSpec(2, [-1.0], [1.0], (0,))
     observations = np.array([[4.4, 1.0], [4.6, 1.0], [-1.5, 1.0], [-1.3, 1.0]])
@@ -275,6 +343,51 @@ def test_a_film_has_a_picture_per_step_at_the_speed_of_the_task(
         pictures.seek(4)
         last = np.asarray(pictures.convert("RGB")).astype(int)
     assert (np.abs(first - last).sum(axis=2) > 30).mean() > 0.02  # something moved
+
+
+def test_a_film_shows_each_action_as_an_arrow_between_its_limits() -> None:
+    task = TaskSpec(2, [-30.0, 1.0], [30.0, 3.0])
+    figure = Figure()
+    labels = Labels(["a", "b"], ["torque [N m]", "speed"])
+    torque, speed = (Gauge.draw(figure, (0.1, 0.1, 0.8), task, labels, i) for i in range(2))
+    for action, start, end, text in ((15.0, 0.0, 15.0, "15"), (-44.0, 0.0, -30.0, "-30")):
+        torque.show(action)
+        assert torque.arrow._posA_posB == [(start, 0.0), (end, 0.0)]
+        assert torque.arrow.get_visible() and torque.text.get_text() == text
+    torque.show(0.01)
+    assert not torque.arrow.get_visible()
+    speed.show(2.0)  # zero is no action here
+    assert speed.arrow._posA_posB == [(1.0, 0.0), (2.0, 0.0)]
+    assert [t.get_text() for t in figure.texts if not t.get_animated()] == labels.actions
+
+
+def test_a_film_has_a_colour_bar_with_start_goal_and_the_path_above_them(
+    learnt: kreps.KREPS,
+) -> None:
+    figure, rng = Figure(), np.random.default_rng(0)
+    recording = Recording([], rng.normal(size=(5, 2)), rng.normal(size=(5, 1)), 20.0)
+    panel = PolicyPanel.draw(figure, recording, learnt.state, learnt.task, LABELS)
+    axes, bar = figure.axes
+    assert list(bar.get_yticks()) == [-30.0, 0.0, 30.0]
+    np.testing.assert_array_equal(marked(axes, "start"), recording.observations[:1])
+    assert len(marked(axes, "highest reward observed")) == 1
+    panel.show(recording.observations[:3], learnt.task)
+    np.testing.assert_array_equal(panel.dot.get_xydata(), recording.observations[2:3])
+    assert panel.parts[0] is panel.trail and panel.parts[-1] is panel.dot
+
+
+def test_a_film_is_as_wide_as_a_page_and_keeps_rare_colours(
+    learnt: kreps.KREPS, tmp_path: Path
+) -> None:
+    frame = np.full((60, 60, 3), 255, dtype=np.uint8)
+    frame[28:32, 28:32] = (250, 120, 20)  # a target of few pixels
+    recording = Recording([frame] * 2, np.zeros((2, 2)), np.full((2, 1), 20.0), 20.0)
+    path = draw_film(recording, learnt.state, learnt.task, LABELS, tmp_path / "a.gif")
+    with Image.open(path) as pictures:
+        assert pictures.size == (800, 400)
+        colours = np.asarray(pictures.convert("RGB")).astype(int)
+    assert (np.abs(colours[:, :400] - (250, 120, 20)).max(axis=2) < 12).sum() > 100
+    assert (np.abs(colours[:, :400] - (209, 96, 61)).max(axis=2) < 12).sum() > 100  # the arrow
 
 
 def test_a_film_of_other_states_shows_the_camera_only(tmp_path: Path) -> None:

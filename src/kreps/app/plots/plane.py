@@ -1,11 +1,18 @@
-"""Drawing over a two-dimensional state space, with angles that wrap around."""
+"""Drawing over a two-dimensional state space, with angles that wrap around.
+
+Far from the data a policy and V are extrapolation, so maps fade there.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
 
 from kreps.algorithms.state import LearnerState
 from kreps.data.task import TaskSpec
@@ -14,6 +21,29 @@ from kreps.kernels.arrays import FloatArray
 
 MAP_POINTS = 121
 """Grid points per axis of a map."""
+
+FADE_FROM, FADE_TO = 0.04, 0.12
+"""Distances to the nearest sample between which a map fades, as shares of the axes."""
+
+FADED = 0.15
+"""Opacity of a map far from all samples."""
+
+START: dict[str, Any] = {
+    "ls": "",
+    "marker": "o",
+    "ms": 6,
+    "mfc": "white",
+    "mec": "black",
+    "mew": 1.2,
+}
+GOAL: dict[str, Any] = {
+    "ls": "",
+    "marker": "*",
+    "ms": 13,
+    "mfc": "#ffd21f",
+    "mec": "black",
+    "mew": 0.9,
+}
 
 
 def state_grid(state: LearnerState, task: TaskSpec) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -43,6 +73,54 @@ def state_grid(state: LearnerState, task: TaskSpec) -> tuple[FloatArray, FloatAr
         axes.append(np.linspace(low, high, MAP_POINTS))
     x, y = np.meshgrid(*axes)
     return axes[0], axes[1], np.stack([x.ravel(), y.ravel()], axis=1)
+
+
+def opacity(
+    x: FloatArray, y: FloatArray, states: FloatArray, state: LearnerState, task: TaskSpec
+) -> FloatArray:
+    """Opacity of a map: 1 near the samples of the window, `FADED` far from all of them.
+
+    Args:
+        x, y: the axes, (k,) each.
+        states: (k squared, 2) grid of `state_grid`.
+        state: with the samples.
+        task: which coordinates are angles.
+
+    Returns:
+        (k, k), rows along y.
+    """
+    from scipy.spatial import cKDTree  # takes 0.1 s to import
+
+    low, length = np.array([x[0], y[0]]), np.array([x[-1] - x[0], y[-1] - y[0]])
+    turns = np.array([1.0 if i in task.periodic else 0.0 for i in range(2)])
+
+    def scaled(points: FloatArray) -> FloatArray:
+        shares = (points - low) / length
+        return np.where(turns > 0.0, shares % 1.0, shares)
+
+    samples = cKDTree(scaled(state.window.transitions.points), boxsize=turns)
+    distance, _ = samples.query(scaled(states))
+    known = np.clip((FADE_TO - distance) / (FADE_TO - FADE_FROM), 0.0, 1.0)
+    return (FADED + (1.0 - FADED) * known).reshape(len(y), len(x))
+
+
+def opaque(picture: AxesImage) -> ScalarMappable:
+    """The colours of a map without its opacity, for a colour bar."""
+    return ScalarMappable(picture.norm, picture.cmap)
+
+
+def mark_start_and_goal(axes: Axes, state: LearnerState, starts: FloatArray) -> list[Line2D]:
+    """Mark start states (m, 2), and the state that the highest reward of the window led to.
+
+    While no reward depends on the state there is no such goal.
+    """
+    marks = axes.plot(*starts.T, label="start", zorder=4, **START)
+    if state.window.reward_depends_on_state:
+        data = state.window.transitions
+        goal = data.points[data.successor[np.argmax(data.rewards)]]
+        name = "highest reward observed"
+        marks += axes.plot(*goal[:, None], label=name, zorder=4, clip_on=False, **GOAL)
+    return marks
 
 
 def path_of(observations: FloatArray, task: TaskSpec) -> FloatArray:

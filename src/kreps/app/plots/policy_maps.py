@@ -6,10 +6,20 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.ticker import MaxNLocator
 
 from kreps.algorithms.state import LearnerState
 from kreps.app.environments import Labels
-from kreps.app.plots.plane import label_axes, path_of, state_grid
+from kreps.app.plots.plane import (
+    FADED,
+    label_axes,
+    mark_start_and_goal,
+    opacity,
+    opaque,
+    path_of,
+    state_grid,
+)
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError
 from kreps.plotting import STYLE
@@ -23,7 +33,8 @@ SHOWN_ROLLOUTS = 10
 def policy_maps(state: LearnerState, task: TaskSpec, labels: Labels) -> Figure:
     """Maps of the policy's mean, its standard deviation and V, of the first action coordinate.
 
-    The latest rollouts are drawn into them: far from these the maps are extrapolation.
+    The latest rollouts are drawn into them.  The maps fade where the window has no data, as they
+    are extrapolation there.
 
     Raises:
         ConfigurationError: the state space is not two-dimensional, or the window has no rollouts.
@@ -35,16 +46,19 @@ def policy_maps(state: LearnerState, task: TaskSpec, labels: Labels) -> Figure:
         )
     assert isinstance(state.policy, CostSensitiveGP | SparseGP) and state.value is not None
     x, y, states = state_grid(state, task)
+    visible = opacity(x, y, states, state, task)
     low, high = task.action_low[0], task.action_high[0]
     mean = np.clip(state.policy.greedy(states)[:, 0], low, high)
     std = state.policy.standard_deviation(states)[:, 0]
+    value = state.value(states)
+    known = value[visible.ravel() == 1.0]  # V may be anything where there are no data
     panels = (
         ("Policy mean", mean, "RdBu_r", (low, high), labels.actions[0]),
-        ("Policy standard deviation", std, "viridis", (0.0, None), labels.actions[0]),
-        ("Value function V", state.value(states), "magma", (None, None), "reward"),
+        ("Policy standard deviation", std, "viridis", (0.0, std.max()), labels.actions[0]),
+        ("Value function V", value, "magma", (known.min(), known.max()), "reward"),
     )
     with rc_context(STYLE):
-        figure = Figure(figsize=(12.5, 3.9))
+        figure = Figure(figsize=(8.4, 4.2))
         plots = figure.subplots(1, 3, sharey=True)
         for axes, (name, values, colours, (vmin, vmax), unit) in zip(plots, panels, strict=True):
             picture = axes.imshow(
@@ -55,20 +69,35 @@ def policy_maps(state: LearnerState, task: TaskSpec, labels: Labels) -> Figure:
                 cmap=colours,
                 vmin=vmin,
                 vmax=vmax,
+                alpha=visible,
                 interpolation="bilinear",
             )
             _draw_rollouts(axes, state, task)
             label_axes(axes, task, labels.observations)
             axes.set_title(name)
-            figure.colorbar(picture, ax=axes, label=unit, pad=0.02)
+            bar = figure.colorbar(opaque(picture), ax=axes, location="bottom", label=unit, pad=0.03)
+            bar.ax.xaxis.set_major_locator(MaxNLocator(5))
         for axes in plots[1:]:
             axes.set_ylabel("")
+        legend_of_maps(figure, plots[0])
     return figure
+
+
+def legend_of_maps(figure: Figure, axes: Axes) -> None:
+    """What the lines and markers of a map mean, in a row below the figure."""
+    handles, names = axes.get_legend_handles_labels()
+    handles.append(Patch(facecolor="#1f4e79", alpha=FADED + 0.1))
+    names.append("faded: no data")
+    figure.legend(handles, names, loc="outside lower center", ncols=len(names))
 
 
 def _draw_rollouts(axes: Axes, state: LearnerState, task: TaskSpec) -> None:
     limits = axes.axis()
-    for rollout in state.window.rollouts[-SHOWN_ROLLOUTS:]:
-        axes.plot(*path_of(rollout.observations, task), color="white", lw=1.6, alpha=0.5)
-        axes.plot(*path_of(rollout.observations, task), color="black", lw=0.7, alpha=0.8)
+    latest = state.window.rollouts[-SHOWN_ROLLOUTS:]
+    for i, rollout in enumerate(latest):
+        path = path_of(rollout.observations, task)
+        axes.plot(*path, color="white", lw=1.8, alpha=0.6)
+        axes.plot(*path, color="black", lw=0.8, alpha=0.8, label=None if i else "latest rollouts")
+    starts = np.array([rollout.observations[0] for rollout in latest])
+    mark_start_and_goal(axes, state, starts)
     axes.axis(limits)
