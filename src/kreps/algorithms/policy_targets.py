@@ -29,6 +29,20 @@ MIN_TARGET_VARIANCE = 1e-4
 """Smallest variance of the targets, in units of the action scale squared, at which priors are
 centred: that of equal targets is zero and has no logarithm."""
 
+LOG_LENGTHSCALE_CENTRE, LOG_LENGTHSCALE_STD = -0.5, 0.7
+"""Prior of a log lengthscale relative to that of the median distance: policies vary faster than the
+states are spread."""
+LOG_SIGNAL_CENTRE, LOG_NOISE_CENTRE, LOG_VARIANCE_STD = -0.3, -1.0, 1.0
+"""Prior of log sf2 and log l relative to the log variance of the targets: more of it is due to the
+state than to noise.  The centres of signal and noise sum to 1.1 of the variance."""
+LOG_LENGTHSCALE_RANGE = (-4.0, 3.0)
+VARIANCE_RANGE = (1e-4, 1e2)
+"""Limits of the search with priors, which keep the Gram matrix well-conditioned.  Lengthscales are
+relative to the median distance, variances in units of the action scale squared."""
+BOUNDED_LENGTHSCALES = (0.3, 1.0)
+BOUNDED_SIGNAL, BOUNDED_NOISE = (0.01, 3.0), (1e-4, 4.0)
+"""Hard ranges of ``policy_fit="bounded"``, in the same units; there is no prior."""
+
 
 @dataclass(frozen=True)
 class PolicyTargets:
@@ -179,20 +193,25 @@ def policy_prior(targets: PolicyTargets, state_kernel: Kernel, policy_fit: str) 
     variance = float(np.mean(share @ centred**2))
     variance += float(share @ targets.target_variance) / centred.shape[1]
     log_variance = np.log(max(variance, MIN_TARGET_VARIANCE))
-    centre = np.concatenate([median - 0.5, [log_variance - 0.3, log_variance - 1.0]])
+    variances = [log_variance + LOG_SIGNAL_CENTRE, log_variance + LOG_NOISE_CENTRE]
+    centre = np.concatenate([median + LOG_LENGTHSCALE_CENTRE, variances])
     if policy_fit == "map":
+        shortest, longest = LOG_LENGTHSCALE_RANGE
+        smallest, largest = np.log([[bound] * 2 for bound in VARIANCE_RANGE])
         return Prior(
             centre=centre,
-            std=np.concatenate([np.full(g, 0.7), [1.0, 1.0]]),
-            low=np.concatenate([median - 4.0, np.log([1e-4, 1e-4])]),
-            high=np.concatenate([median + 3.0, np.log([1e2, 1e2])]),
+            std=np.concatenate([np.full(g, LOG_LENGTHSCALE_STD), [LOG_VARIANCE_STD] * 2]),
+            low=np.concatenate([median + shortest, smallest]),
+            high=np.concatenate([median + longest, largest]),
             strength=1.0 / targets.total_weight,  # the loss is per unit of weight
         )
+    low, high = np.log([BOUNDED_SIGNAL, BOUNDED_NOISE]).T
+    shortest, longest = np.log(BOUNDED_LENGTHSCALES)
     return Prior(
         centre=centre,
         std=np.ones(g + 2),
-        low=np.concatenate([median + np.log(0.3), np.log([0.01, 1e-4])]),
-        high=np.concatenate([median, np.log([3.0, 4.0])]),
+        low=np.concatenate([median + shortest, low]),
+        high=np.concatenate([median + longest, high]),
         strength=0.0,
     )
 
