@@ -91,9 +91,9 @@ def session(path: Path) -> Any:
 
 def note(path: Path) -> dict[str, Any]:
     model = onnx.load(str(path))
-    (entry,) = model.metadata_props
-    assert entry.key == "kreps"
-    return json.loads(entry.value)
+    found = {entry.key: entry.value for entry in model.metadata_props}
+    assert set(found) == {"kreps", "sha256"}
+    return json.loads(found["kreps"])
 
 
 def errors(policy: kreps.Policy, path: Path, states: FloatArray, dtype: str) -> tuple[float, float]:
@@ -277,12 +277,62 @@ def test_a_batch_may_be_empty(dtype: str, tmp_path: Path) -> None:
         assert found.shape == (0, 2)
 
 
+@pytest.mark.parametrize("optimised", [True, False])
 @pytest.mark.parametrize("dtype", TOLERANCES)
-def test_observations_that_are_not_finite_give_nan(dtype: str, tmp_path: Path) -> None:
+def test_observations_that_are_not_finite_are_an_error_of_the_model(
+    dtype: str, optimised: bool, tmp_path: Path
+) -> None:
     random_policy(TASKS["swing-up"]).export_onnx(tmp_path / "x.onnx", dtype)
-    bad = np.array([[np.nan, 0.0], [0.0, np.nan], [np.inf, 0.0]], dtype=dtype)
-    for found in session(tmp_path / "x.onnx").run(None, {"observation": bad}):
-        assert np.isnan(found).all()
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4
+    if not optimised:
+        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    model = onnxruntime.InferenceSession(str(tmp_path / "x.onnx"), options)
+    good = [0.5, -1.0]
+    for number in (np.nan, np.inf, -np.inf):
+        for bad in ([number, 0.0], [0.0, number]):
+            given = np.array([good, bad], dtype)
+            with pytest.raises(Exception, match="observation_or_action_is_not_finite"):
+                model.run(None, {"observation": given})
+    for found in model.run(None, {"observation": np.array([good], dtype)}):
+        assert np.isfinite(found).all()
+
+
+def test_actions_that_are_not_finite_are_an_error_of_the_model(tmp_path: Path) -> None:
+    task = TASKS["plain"]
+    own = random_policy(task).compressed(5).process
+    assert isinstance(own, SparseGP)
+    huge = np.full((5, 2), [1e38, 0.0])  # the largest number of single precision is 3.4e38
+    alike = Kernel(task.state_factors, np.full(4, 1e3))
+    policy = SparseGP(task, alike, own.states, huge, own.explained, own.signal, own.noise)
+    assert export.write_onnx(policy, tmp_path / "x.onnx", "float32", tolerance=np.inf) == "float32"
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = 4
+    model = onnxruntime.InferenceSession(str(tmp_path / "x.onnx"), options)
+    with pytest.raises(Exception, match="observation_or_action_is_not_finite"):
+        model.run(None, {"observation": own.states.astype(np.float32)})
+
+
+def test_the_error_is_that_of_the_standard_too(tmp_path: Path) -> None:
+    """Gather with an index out of bounds is an error by ONNX's specification."""
+    reference = pytest.importorskip("onnx.reference")
+    random_policy(TASKS["swing-up"]).export_onnx(tmp_path / "x.onnx")
+    model = reference.ReferenceEvaluator(str(tmp_path / "x.onnx"))
+    with pytest.raises(IndexError):
+        model.run(None, {"observation": np.array([[np.nan, 0.0]])})
+
+
+def test_a_damaged_copy_of_a_model_is_found(tmp_path: Path) -> None:
+    path = tmp_path / "x.onnx"
+    random_policy(TASKS["swing-up"]).export_onnx(path)
+    kreps.check_file(path)
+    content = path.read_bytes()
+    for place in np.linspace(0, len(content) - 1, 200).astype(int).tolist():
+        damaged = bytearray(content)
+        damaged[place] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        with pytest.raises(StorageError, match="cannot rely on"):
+            kreps.check_file(path)
 
 
 # ---- metadata ---------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from kreps.kernels.kernel import (
     median_lengthscales,
 )
 from kreps.kernels.regression import KernelEmbedding
+from kreps.learning.storage.checksum import sealed
 from kreps.models.transition import embedding_origin, state_kernel, successor_features
 from kreps.presets import settings_of
 
@@ -255,7 +257,8 @@ def test_a_forged_shape_is_an_error_when_it_is_read(learnt: kreps.KREPS, tmp_pat
     for shape in (b"[1, 9]", b"[-1,6]"):
         forged = content.replace(rb"\"image_shape\": [1, 6]", rb"\"image_shape\": " + shape)
         assert forged != content
-        (tmp_path / "bad").write_bytes(forged)
+        (digits,) = re.findall(rb"[0-9a-f]{64}", content)
+        (tmp_path / "bad").write_bytes(sealed(forged.replace(digits, b"0" * 64)))
         with pytest.raises(StorageError, match="image_shape"):
             kreps.load_policy(tmp_path / "bad")
 

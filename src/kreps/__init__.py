@@ -30,7 +30,12 @@ if TYPE_CHECKING:
     from kreps.learning.learner import IterationReport
     from kreps.learning.methods import KREPS, NPALP, GridValueIteration, ValueIteration
     from kreps.learning.policy import Policy, load_policy
-    from kreps.learning.storage import load_rollouts, rollout_folder, save_rollouts
+    from kreps.learning.storage import (
+        check_file,
+        load_rollouts,
+        rollout_folder,
+        save_rollouts,
+    )
     from kreps.presets import PRESETS
     from kreps.settings import RKHS, Exploration, Grid, LowRank, ModelBased, Settings
 
@@ -61,6 +66,7 @@ __all__ = [
     "StorageError",
     "TaskSpec",
     "ValueIteration",
+    "check_file",
     "load_policy",
     "load_rollouts",
     "rollout_folder",
@@ -79,6 +85,7 @@ _HOMES = {
     "IterationReport": "learning.learner",
     "Policy": "learning.policy",
     "load_policy": "learning.policy",
+    "check_file": "learning.storage",
     "RandomRestart": "envs.restart",
     "PRESETS": "presets",
     "RKHS": "settings",

@@ -6,8 +6,20 @@ Messages name the value found, the limit that it violates, and the remedy.
 from __future__ import annotations
 
 
+def printable(text: str) -> str:
+    """The text with escapes (``\\x1b``) in place of all that a terminal might act on or not show.
+
+    These are control characters, line breaks among them, and halves of surrogate pairs, as text of
+    files, environments and file names may hold them.
+    """
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 class KrepsError(Exception):
-    """Base class of all errors that kreps raises."""
+    """Base class of all errors that kreps raises; as text it is one line that can be printed."""
+
+    def __str__(self) -> str:
+        return printable(super().__str__())
 
 
 class ConfigurationError(KrepsError, ValueError):
@@ -31,7 +43,7 @@ class TrialFailure(KrepsError, RuntimeError):
 
 
 class NumericalError(KrepsError, ArithmeticError):
-    """A matrix could not be factorised even with the largest permitted jitter."""
+    """A matrix could not be factorised with any permitted jitter, or an action is not finite."""
 
 
 class StorageError(KrepsError, OSError):

@@ -125,7 +125,10 @@ def present_columns(columns: Sequence[str]) -> tuple[str, ...]:
 # ---- files of arrays --------------------------------------------------------------------------
 
 FILE_VERSIONS = (1, 2)
-"""Versions of the file format that are translated.  Version 1 is version 2 with fewer settings."""
+"""Versions of the file format that are translated.
+
+Version 1 is version 2 with fewer settings.  Version 3 is the present one without a checksum.
+"""
 
 Tensors = dict[str, NDArray[Any]]
 Header = dict[str, Any]
@@ -175,7 +178,7 @@ NO_FOURIER_V = (
 
 
 def present_file(kind: str, tensors: Tensors, header: Header) -> tuple[Tensors, Header]:
-    """Arrays and header of format version 1 or 2 as those of version 3.
+    """Arrays and header of format version 1 or 2 as those of the present one.
 
     Args:
         kind: "policy", "rollouts" or "checkpoint".
@@ -184,7 +187,7 @@ def present_file(kind: str, tensors: Tensors, header: Header) -> tuple[Tensors, 
 
     Raises:
         StorageError, KeyError, TypeError, ValueError: something is missing, or makes no sense.
-            Shapes and values that are the same now are left to be checked as those of version 3.
+            Shapes and values that are the same now are left to be checked as present ones.
     """
     named = header.get("arrays", sorted(tensors) if header["version"] == 1 else None)
     if not isinstance(named, list):
@@ -196,7 +199,7 @@ def present_file(kind: str, tensors: Tensors, header: Header) -> tuple[Tensors, 
         raise StorageError("it holds arrays that its header does not name")
     if kind == "rollouts":
         new = _present_rollouts(tensors, "rollouts")
-        return new, {"steps": header.get("samples"), "rollouts": _tree(new, "rollouts")}
+        return new, {"rollouts": _tree(new, "rollouts")}
     task = {"groups": [], "image_shape": None, **header["task"]}
     if kind == "policy":
         new = _present_arrays(tensors)
@@ -263,9 +266,13 @@ def _present_rollouts(tensors: Tensors, name: str) -> Tensors:
     whole = lengths.ndim == 1 and ((lengths >= 1) & (lengths <= n) & (lengths % 1 == 0)).all()
     if not whole or lengths.sum() != n:
         raise StorageError("the lengths of its rollouts do not fit their data")
+    if not ((ended == 0) | (ended == 1)).all():
+        raise StorageError(
+            "array 'window.terminated' holds flags other than 0 and 1: it is damaged"
+        )
     return {
         f"{name}.offsets": np.cumsum([0, *lengths.astype(np.int64)], dtype=np.int64),
-        f"{name}.terminated": ended != 0,
+        f"{name}.terminated": ended == 1,
         f"{name}.points": points,
         f"{name}.actions": actions,
         f"{name}.rewards": rewards,

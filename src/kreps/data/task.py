@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kreps.errors import ConfigurationError, DataError
+from kreps.errors import ConfigurationError, DataError, NumericalError
 from kreps.intake import as_array, is_sane
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Factor, factors_of
@@ -155,7 +155,17 @@ class TaskSpec:
         return self.action_centre + self.action_scale * actions
 
     def clip(self, actions: FloatArray) -> FloatArray:
-        """The *applied* actions: the commanded ones, clipped to their limits."""
+        """The *applied* actions: the commanded ones, clipped to their limits.
+
+        Raises:
+            NumericalError: one is NaN or infinite, so that no action can be applied.
+        """
+        if not np.isfinite(actions).all():
+            raise NumericalError(
+                "an action is NaN or infinite, so it is not applied: the numbers of the policy are "
+                "out of range; load another copy of its file, or learn it again with observations "
+                "and rewards in other units"
+            )
         return np.clip(actions, self.action_low, self.action_high)
 
     def scaled_applied(self, actions: FloatArray) -> FloatArray:

@@ -16,7 +16,7 @@ from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.envs.batch import BatchModel, SettableModel
 from kreps.envs.restart import restart_length, stratified_lengths
-from kreps.errors import ConfigurationError, DataError, EnvironmentFailure
+from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, NumericalError
 from kreps.intake import as_array, as_flag, as_flags, as_number, as_numbers
 from kreps.kernels.arrays import BoolArray, FloatArray, grid_points
 from kreps.learning.environment import (
@@ -230,7 +230,7 @@ def _simulate_batch(
             observations[t + 1, live] = _checked(model.observe(states[live]), len(live), task)
             ends[live[done]] = t + 1
             terminated[live[done]] = True
-    except DataError:
+    except (DataError, NumericalError):
         raise
     except Exception as error:
         raise _failure(error, "a batch of rollouts", t) from error
@@ -274,6 +274,8 @@ def _simulate_one(
     except DataError as error:
         where = f"rollout {number} of the environment, after {len(actions)} steps"
         raise DataError(f"{where}: {error}") from error
+    except NumericalError:
+        raise
     except Exception as error:
         raise _failure(error, f"rollout {number}", len(rewards)) from error
     try:

@@ -55,6 +55,7 @@ class Policy:
 
         Raises:
             DataError: another shape, NaN or infinities.
+            NumericalError: the action is NaN or infinite; it is not handed out.
         """
         task = self.process.task
         remedy = "no action is defined for it, so check the sensors"
@@ -121,7 +122,9 @@ class Policy:
 
         Its input is ``observation`` (batch, ds).  Its outputs are ``action`` (batch, da), the mean
         clipped to the task's limits, and ``standard_deviation`` (batch, da) of the commanded
-        action, both in the task's units.
+        action, both in the task's units.  If an observation or a result is NaN or infinite, the
+        model ends with an error in place of an action.  `kreps.check_file` tells whether a copy of
+        the model is undamaged.
 
         Args:
             path: such as ``policy.onnx``; the folder must exist.

@@ -7,6 +7,7 @@ from kreps.learning.storage.checkpoints import (
     require_storable,
     save_checkpoint,
 )
+from kreps.learning.storage.checksum import check_file
 from kreps.learning.storage.files import MAX_FILE_BYTES, VERSION
 from kreps.learning.storage.policies import load_policy, save_policy
 from kreps.learning.storage.rollouts import (
@@ -21,6 +22,7 @@ __all__ = [
     "POLICIES_OF_METHOD",
     "VERSION",
     "RolloutFile",
+    "check_file",
     "load_checkpoint",
     "load_policy",
     "load_rollouts",

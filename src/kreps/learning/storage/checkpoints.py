@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,7 +23,7 @@ from kreps.learning.storage.codec import (
     Tensors,
     Whole,
 )
-from kreps.learning.storage.files import MAX_FILE_BYTES, reading, write_arrays
+from kreps.learning.storage.files import MAX_FILE_BYTES, reading, warn_of, write_arrays
 from kreps.learning.storage.policies import (
     POLICY,
     TASK,
@@ -154,9 +153,7 @@ def load_checkpoint(
         _check_presence(stored, method)
         given = {"task": task, "capacity": settings.window}
         (state,) = arrays.decode([("", STATE, stored)], given, **_sizes(task, stored))
-        notes = header.get("notes", [])
-    for note in notes:
-        warnings.warn(f"{path}: {note}", UserWarning, stacklevel=2)
+    warn_of(path, header, stacklevel=3)
     return state, task, settings, header["seed"]
 
 

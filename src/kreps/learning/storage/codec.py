@@ -122,6 +122,8 @@ class Array:
         """
         if self.dtype == "F64":
             check_sane(name, values)
+        if self.dtype == "BOOL" and (values.view(np.uint8) > 1).any():
+            raise StorageError(f"array {name!r} holds flags other than 0 and 1: it is damaged")
         if self.limit is not None and not np.all(self.limit.holds(values)):
             raise StorageError(f"array {name!r} holds numbers that are not {self.limit.text}")
 

@@ -22,6 +22,7 @@ from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Factor, Periodic, SmoothedImage, SquaredExponential, smoothing
 from kreps.learning.storage.atomic import write_atomically
+from kreps.learning.storage.checksum import BLANK, NAME, sealed
 from kreps.policies.sparse_gp import SparseGP
 
 OPSET, IR_VERSION = 17, 8
@@ -29,6 +30,9 @@ OPSET, IR_VERSION = 17, 8
 
 Number = type[np.floating[Any]]
 DTYPES: dict[str, Number] = {"float64": np.float64, "float32": np.float32}
+
+GUARD = "observation_or_action_is_not_finite"
+"""Name of the node that fails if a number is NaN or infinite."""
 
 SINGLE_PRECISION_TOLERANCE = 1e-4
 """Largest error of the mean that single precision may cause, in units of the action scale."""
@@ -44,8 +48,10 @@ def write_onnx(
 
     Input ``observation`` (batch, ds).  Outputs ``action`` (batch, da), the mean clipped to the
     task's limits, and ``standard_deviation`` (batch, da) of the commanded action, both in the
-    task's units.  A batch needs memory for batch x centres x coordinates numbers.  A model cannot
-    raise an error: an observation of NaN gives actions of NaN.
+    task's units.  A batch needs memory for batch x centres x coordinates numbers.
+
+    A model never hands out a number that is not finite: if one is among observations or results,
+    its evaluation ends with an error that has `GUARD` in its text.
 
     Args:
         policy: r centres.
@@ -87,8 +93,8 @@ def write_onnx(
             "standard_deviation: of the commanded action; both in the units of the task."
         ),
     )
-    onnx.helper.set_model_props(model, {"kreps": _note(policy, arithmetic)})
-    write_atomically(path, model.SerializeToString(deterministic=True))
+    onnx.helper.set_model_props(model, {"kreps": _note(policy, arithmetic), NAME: BLANK})
+    write_atomically(path, sealed(model.SerializeToString(deterministic=True)))
     return arithmetic
 
 
@@ -163,32 +169,22 @@ class _Graph:
         self.nodes.append(self.helper.make_node(operation, inputs, [name], name=name, **attributes))
         return name
 
-    def cast(self, values: str, dtype: Number, out: str = "") -> str:
-        return self.node("Cast", values, out=out, to=self.kind(dtype))
+    def cast(self, values: str, dtype: Any) -> str:
+        return self.node("Cast", values, to=self.kind(dtype))
 
 
 def _graph_of(policy: SparseGP, helper: Any, border: Number, arithmetic: Number) -> Any:
     """The graph with inputs and outputs of dtype ``border``, computed in ``arithmetic``."""
     graph, task = _Graph(helper, arithmetic), policy.task
-    k = _kernel_values(graph, policy, graph.cast("observation", arithmetic))
-
-    weights = graph.constant("mean_weights", policy.mean_weights * task.action_scale)
-    centre = graph.constant("action_centre", task.action_centre)
-    mean = graph.cast(graph.node("Add", graph.node("MatMul", k, weights), centre), border)
+    commanded, deviation = _mean_and_deviation(graph, policy, border)
+    zero = _zero_if_finite(graph, ("observation", commanded, deviation), border)
     low, high = (
         graph.constant(name, _inwards(limit, task.action_centre, border), border)
         for name, limit in (("action_low", task.action_low), ("action_high", task.action_high))
     )
-    graph.node("Min", graph.node("Max", mean, low), high, out="action")
-
-    part = graph.node("MatMul", k, graph.constant("explained", policy.explained.T))
-    squares = graph.node("Mul", part, part)
-    explained = graph.node("ReduceSum", squares, graph.integers("centre_axis", [1]), keepdims=1)
-    left = graph.node("Sub", graph.constant("signal", policy.signal), explained)
-    left = graph.node("Max", left, graph.constant("zero", 0.0))
-    deviation = graph.node("Sqrt", graph.node("Add", left, graph.constant("noise", policy.noise)))
-    deviation = graph.node("Mul", deviation, graph.constant("action_scale", task.action_scale))
-    graph.cast(deviation, border, out="standard_deviation")
+    action = graph.node("Min", graph.node("Max", commanded, low), high)
+    graph.node("Add", action, zero, out="action")
+    graph.node("Add", deviation, zero, out="standard_deviation")
 
     widths = {
         "observation": task.observation_size,
@@ -202,6 +198,40 @@ def _graph_of(policy: SparseGP, helper: Any, border: Number, arithmetic: Number)
     return helper.make_graph(
         graph.nodes, "kreps_policy", borders[:1], borders[1:], initializer=graph.constants
     )
+
+
+def _mean_and_deviation(graph: _Graph, policy: SparseGP, border: Number) -> tuple[str, str]:
+    """Mean and standard deviation of the commanded action, (batch, da) each."""
+    task = policy.task
+    k = _kernel_values(graph, policy, graph.cast("observation", graph.dtype))
+
+    weights = graph.constant("mean_weights", policy.mean_weights * task.action_scale)
+    centre = graph.constant("action_centre", task.action_centre)
+    mean = graph.cast(graph.node("Add", graph.node("MatMul", k, weights), centre), border)
+
+    part = graph.node("MatMul", k, graph.constant("explained", policy.explained.T))
+    squares = graph.node("Mul", part, part)
+    explained = graph.node("ReduceSum", squares, graph.integers("centre_axis", [1]), keepdims=1)
+    left = graph.node("Sub", graph.constant("signal", policy.signal), explained)
+    left = graph.node("Max", left, graph.constant("zero", 0.0))
+    deviation = graph.node("Sqrt", graph.node("Add", left, graph.constant("noise", policy.noise)))
+    deviation = graph.node("Mul", deviation, graph.constant("action_scale", task.action_scale))
+    return mean, graph.cast(deviation, border)
+
+
+def _zero_if_finite(graph: _Graph, values: Sequence[str], border: Number) -> str:
+    """A zero, which cannot be computed if any of the values is NaN or infinite.
+
+    An operation of ONNX cannot be made to fail, except by an index that is out of bounds: the zero
+    is taken out of a vector of one element, at the number of values that are not finite.
+    """
+    counts = []
+    for name in values:
+        faulty = graph.node("Or", graph.node("IsNaN", name), graph.node("IsInf", name))
+        counts.append(graph.node("ReduceSum", graph.cast(faulty, np.float64), keepdims=0))
+    index = graph.cast(graph.node("Sum", *counts), np.int64)
+    zeros = graph.constant("zeros", [0.0], border)
+    return graph.node("Gather", zeros, index, out=GUARD, axis=0)
 
 
 def _kernel_values(graph: _Graph, policy: SparseGP, observation: str) -> str:

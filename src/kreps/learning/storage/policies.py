@@ -29,7 +29,7 @@ from kreps.learning.storage.codec import (
     StoredArrays,
     Tensors,
 )
-from kreps.learning.storage.files import MAX_FILE_BYTES, reading, write_arrays
+from kreps.learning.storage.files import MAX_FILE_BYTES, reading, warn_of, write_arrays
 from kreps.policies.base import LearntPolicy
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT, CostSensitiveGP
 from kreps.policies.sparse_gp import SparseGP
@@ -197,4 +197,5 @@ def load_policy(path: str | Path) -> LearntPolicy:
         policy: LearntPolicy
         nodes = [("policy", POLICY, header["policy"])]
         (policy,) = arrays.decode(nodes, {"task": task}, **task_sizes(task))
+    warn_of(path, header, stacklevel=3)
     return policy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,8 +13,15 @@ from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.errors import DataError, StorageError
 from kreps.learning.storage.atomic import given_path
-from kreps.learning.storage.codec import DATA, Array, Converted, Record, Tensors
-from kreps.learning.storage.files import MAX_FILE_BYTES, reading, write_arrays
+from kreps.learning.storage.codec import DATA, Array, Converted, Record, Sizes, Tensors
+from kreps.learning.storage.files import (
+    MAX_FILE_BYTES,
+    NO_CHECKSUM,
+    Header,
+    reading,
+    warn_of,
+    write_arrays,
+)
 
 
 def _checked(rollouts: Rollouts, given: Mapping[str, Any]) -> Rollouts:
@@ -59,7 +67,7 @@ def save_rollouts(
     if not flat:
         raise DataError("there is no rollout to save; give at least one")
     tensors: Tensors = {}
-    header = {"steps": flat.steps, "rollouts": ROLLOUTS.encode(flat, "rollouts", tensors)}
+    header = {"rollouts": ROLLOUTS.encode(flat, "rollouts", tensors)}
     write_arrays(path, "rollouts", tensors, header, max_bytes)
 
 
@@ -69,10 +77,16 @@ def load_rollouts(path: str | Path) -> Rollouts:
     Raises:
         StorageError: the file is missing, damaged or foreign.
     """
+    rollouts, header = _loaded(path)
+    warn_of(path, header, stacklevel=2)
+    return rollouts
+
+
+def _loaded(path: str | Path) -> tuple[Rollouts, Header]:
     with reading(path, "rollouts") as (arrays, header):
         rollouts: Rollouts
         (rollouts,) = arrays.decode([("rollouts", ROLLOUTS, header["rollouts"])], {})
-    return rollouts
+    return rollouts, header
 
 
 @dataclass(frozen=True)
@@ -93,7 +107,7 @@ class RolloutFile:
         Raises:
             StorageError: the file is damaged, or has another number of steps.
         """
-        rollouts = load_rollouts(self.path)
+        rollouts, _ = _loaded(self.path)
         if rollouts.steps != self.steps:
             raise StorageError(
                 f"{self.path} holds {rollouts.steps} samples, but had {self.steps} when the folder "
@@ -120,11 +134,20 @@ def rollout_folder(path: str | Path) -> Dataset:
         raise StorageError(
             f"{folder} holds no *.safetensors; write rollouts there with kreps.save_rollouts"
         )
-    chunks = []
+    chunks, without = [], 0
     for file in files:
-        with reading(file, "rollouts") as (_, header):
-            steps = header.get("steps")
-            if type(steps) is not int or steps < 1:
-                raise StorageError(f"its header has {steps!r:.40} for its number of steps")
-        chunks.append(RolloutFile(file, steps))
+        with reading(file, "rollouts", verify=False) as (arrays, header):  # verified by `load`
+            sizes: Sizes = {}
+            ROLLOUTS.check(header["rollouts"], "rollouts", dict(arrays.layout), sizes)
+            if sizes["n"] < 1:
+                raise StorageError("it holds no step")
+        chunks.append(RolloutFile(file, sizes["n"]))
+        without += NO_CHECKSUM in header["notes"]
+    if without:
+        warnings.warn(
+            f"{folder}: {without} of its {len(files)} files have no checksum, as those of earlier "
+            "versions, so damage to them would go unnoticed; save them again with this version",
+            UserWarning,
+            stacklevel=2,
+        )
     return Dataset(tuple(chunks))
