@@ -8,12 +8,11 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from inspect import getdoc
 from typing import Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.text import Text
 
 import kreps
 from kreps.app.cli.export import EXPORT_EXAMPLES, export
@@ -30,8 +29,9 @@ from kreps.app.cli.inspect import (
 from kreps.app.cli.reproduce import REPRODUCE_EXAMPLES, SEARCH_EXAMPLES, reproduce, search
 from kreps.app.cli.settings import SETTINGS_EXAMPLES, settings, settings_help
 from kreps.app.cli.train import RESUME_EXAMPLES, TRAIN_EXAMPLES, resume, train
-from kreps.app.console import say
+from kreps.app.console import guarded, say, say_error
 from kreps.errors import KrepsError
+from kreps.terminal import printable
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -81,14 +81,26 @@ def main() -> None:
         number = getattr(signal, name, None)
         if number is not None and signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, signal.default_int_handler)
+    with guarded() as loss:
+        code = _run()
+    if loss.error is not None:
+        stored = "" if code else "; all files of the command are written"
+        say_error(f"standard output was lost: {loss.error.strerror}{stored}")
+        code = code or 1
+    sys.exit(code)
+
+
+def _run() -> int:
+    """Run a command and return its exit status."""
     try:
-        sys.exit(app(standalone_mode=False))  # a command's typer.Exit is returned as its code
+        return app(standalone_mode=False) or 0  # a command's typer.Exit is returned as its code
     except KrepsError as error:
-        message = Text.assemble(("error: ", "bold red"), str(error))
-        Console(stderr=True).print(message, soft_wrap=True)
-        sys.exit(2)
+        say_error(str(error))
     except Exception as error:
-        if hasattr(error, "show"):  # a usage error of the command line
+        if not hasattr(error, "show"):
+            raise
+        if hasattr(error, "message"):  # a usage error of the command line
+            error.message = printable(error.message)
+        with suppress(OSError):
             error.show()
-            sys.exit(2)
-        raise
+    return 2
