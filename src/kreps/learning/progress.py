@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import textwrap
+from collections.abc import Mapping, Sequence
+from itertools import accumulate
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO, cast
 
 from rich.console import Console
 from rich.live import Live
@@ -15,12 +18,23 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 from rich.table import Table
+from rich.text import Text
+
+from kreps.terminal import Output
 
 if TYPE_CHECKING:
     from kreps.learning.learner import IterationReport, Learner
 
-SHOWN_ROWS = 24
-"""Rows of the live table: those of the latest iterations."""
+GAP = "  "
+WIDTHS = {"iter": 4, "reward": 7, "ESS": 4, "CPU s": 5}
+OTHER_WIDTH = 6
+"""Smallest widths of columns; one grows where a value is longer."""
+
+STAGES_PART = 5
+"""The time of each stage takes at most this part of the height, so that rows stay visible."""
+
+ALWAYS_SHOWN = 3
+"""Number of columns that are shown however narrow the terminal is."""
 
 
 def seconds_by_stage(report: IterationReport) -> dict[str, float]:
@@ -31,13 +45,22 @@ def seconds_by_stage(report: IterationReport) -> dict[str, float]:
 class ProgressTable:
     """A callback that shows each iteration as a row, and the remaining time.
 
+    In a terminal a row stays where it was printed, above a bar at the bottom, so that the newest
+    row and the bar are visible in a window of any height.  The headings are repeated before they
+    leave the window.  Columns that do not fit in its width are left out; all numbers are in the
+    reports.
+
     Args:
         target: number of updates after which learning ends.
     """
 
     def __init__(self, target: int) -> None:
         self._console = Console()
-        self._rows: list[dict[str, str]] = []
+        self._output = cast(TextIO, Output(cast(TextIO, self._console.file)))
+        self._console.file = self._output
+        self._widths: dict[str, int] = {}
+        self._headings: list[str] = []
+        self._rows_below = 0  # the headings
         self._stages: dict[str, float] = {}
         self._bar = Progress(
             TextColumn("learning"),
@@ -48,7 +71,7 @@ class ProgressTable:
             console=self._console,
         )
         self._task = self._bar.add_task("learning", total=target, note="")
-        self._live = Live(self._layout(), console=self._console, refresh_per_second=4)
+        self._live = Live(self._footer(), console=self._console, refresh_per_second=4)
 
     def __enter__(self) -> ProgressTable:
         if self._console.is_terminal:
@@ -63,10 +86,10 @@ class ProgressTable:
     ) -> None:
         if self._console.is_terminal:
             self._bar.update(self._task, note="")
-            self._live.update(self._layout(), refresh=True)
+            self._live.update(self._footer(), refresh=True)
             self._live.stop()
         elif self._stages:
-            print(self._stage_line(), flush=True)
+            self._print_line(self._stage_line())
 
     def rollouts_done(self, count: int) -> None:
         """Show how many rollouts of the iteration are complete."""
@@ -86,27 +109,59 @@ class ProgressTable:
             "reward": f"{report.average_reward:.4g}",
             **shown,
             "CPU s": f"{sum(stages.values()):.2f}",
-            "note": note,
         }
         if self._console.is_terminal:
-            self._rows.append(row)
             self._bar.update(self._task, completed=report.iteration)
-            self._live.update(self._layout())
+            self._live.update(self._footer())
+            self._print_row(row, note.strip())
         else:
-            print("  ".join(f"{name} {value}" for name, value in row.items() if value), flush=True)
+            row["note"] = note
+            self._print_line("  ".join(f"{name} {text}" for name, text in row.items() if text))
 
-    def _layout(self) -> Table:
-        table = Table(box=None, pad_edge=False)
-        for name in self._rows[-1] if self._rows else ():
-            table.add_column(name, justify="left" if name == "note" else "right")
-        for row in self._rows[-SHOWN_ROWS:]:
-            table.add_row(*row.values())
-        whole = Table.grid()
-        whole.add_row(table)
-        if self._stages:
-            whole.add_row(f"[dim]{self._stage_line()}[/dim]")
-        whole.add_row(self._bar)
-        return whole
+    def _print_line(self, line: str) -> None:
+        print(line, file=self._output, flush=True)
+
+    def _print_row(self, row: Mapping[str, str], note: str) -> None:
+        """Print a row above the bar, with its headings if they changed or left the window."""
+        for name, value in row.items():
+            least = WIDTHS.get(name, OTHER_WIDTH)
+            self._widths[name] = max(self._widths.get(name, least), len(name), len(value))
+        names = self._fitting_columns(list(row))
+        headings = [name.rjust(self._widths[name]) for name in names]
+        line = GAP.join(row[name].rjust(self._widths[name]) for name in names)
+        if note and len(line) + len(GAP) + len(note) <= self._console.width:
+            line, note = f"{line}{GAP}{note}", ""
+        lines = [line]
+        if note:  # below, as it does not fit
+            indent = " " * (self._widths["iter"] + len(GAP))
+            width = max(self._console.width, 2 * len(indent))
+            lines += textwrap.wrap(note, width, initial_indent=indent, subsequent_indent=indent)
+        height = self._console.height - len(lines) - len(self._console.render_lines(self._footer()))
+        if headings != self._headings or self._rows_below >= height:
+            self._console.print(Text(GAP.join(headings), style="bold"), soft_wrap=True)
+            self._headings, self._rows_below = headings, 1
+        self._rows_below += len(lines)
+        self._console.print(Text("\n".join(lines)), soft_wrap=True)
+
+    def _fitting_columns(self, names: Sequence[str]) -> list[str]:
+        """The columns from the left that fit in the width."""
+        ends = accumulate(len(GAP) + self._widths[name] for name in names)
+        fitting = [
+            name
+            for name, end in zip(names, ends, strict=True)
+            if end - len(GAP) <= self._console.width
+        ]
+        return list(names[: max(len(fitting), ALWAYS_SHOWN)])
+
+    def _footer(self) -> Table:
+        """What stays at the bottom: the bar, and the time of each stage where there is room."""
+        footer = Table.grid()
+        footer.add_row(self._bar)
+        line = Text(self._stage_line(), style="dim")
+        room = self._console.height // STAGES_PART
+        if self._stages and len(line.wrap(self._console, self._console.width)) <= room:
+            footer.add_row(line)
+        return footer
 
     def _stage_line(self) -> str:
         stages = ", ".join(f"{name} {s:.1f}" for name, s in self._stages.items())

@@ -1,0 +1,150 @@
+"""The progress display in windows of any size: what is on the screen after each iteration."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from kreps.learning import progress
+from kreps.learning.progress import ProgressTable
+from kreps.terminal import Output
+
+NOTE = "eta at its floor  rejected: the previous policy acts"
+
+
+class Update:
+    """The report of an update with a long note and many stages."""
+
+    seconds = dict.fromkeys(
+        ("basis", "embedding fit", "embedding", "dual", "policy fit", "generated samples"), 0.1
+    )
+
+    def shown(self) -> dict[str, str]:
+        return {
+            "KL / bound": "0.239 / 1",
+            "eta": "0.01",
+            "ESS": "1733",
+            "gap": "3e-08",
+            "note": NOTE,
+        }
+
+
+def report(iteration: int) -> Any:
+    return SimpleNamespace(
+        iteration=iteration,
+        steps=500 * iteration,
+        average_reward=-1.234e-6,
+        update=Update(),
+        rollout_seconds=0.1,
+    )
+
+
+class Screen:
+    """What a terminal of some size has received: all lines, of which the last ones are visible."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.width, self.height = width, height
+        self.lines, self.row, self.column = [""], 0, 0
+
+    def receive(self, text: str) -> None:
+        for part in re.findall(r"\x1b\[[0-9;?]*[A-Za-z]|[^\x1b]", text):
+            if part.startswith("\x1b"):
+                number = int(re.sub(r"\D", "", part) or 1)
+                if part.endswith("A"):  # the cursor stops at the upper edge
+                    self.row = max(self.row - number, len(self.lines) - self.height, 0)
+                elif part.endswith("K"):
+                    self.lines[self.row] = ""
+            elif part == "\r":
+                self.column = 0
+            elif part == "\n" or self.column == self.width:
+                self.row, self.column = self.row + 1, 0
+                self.lines += [""] * (self.row == len(self.lines))
+            if len(part) == 1 and part not in "\r\n":
+                line = self.lines[self.row].ljust(self.column)
+                self.lines[self.row] = line[: self.column] + part + line[self.column + 1 :]
+                self.column += 1
+
+    @property
+    def visible(self) -> list[str]:
+        return self.lines[-self.height :]
+
+
+def screens(
+    width: int, height: int, iterations: int, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Screen]:
+    """The screen after each iteration."""
+    out, screen = io.StringIO(), Screen(width, height)
+    console = Console(file=out, force_terminal=True, width=width, height=height)
+    monkeypatch.setattr(progress, "Console", lambda: console)
+    with ProgressTable(iterations) as table:
+        for i in range(1, iterations + 1):
+            table(SimpleNamespace(exploring=False), report(i))  # type: ignore[arg-type]
+            table._live.refresh()
+            screen.receive(out.getvalue())
+            out.truncate(0)
+            out.seek(0)
+            yield screen
+
+
+@pytest.mark.parametrize(("width", "height"), [(80, 24), (40, 20), (120, 50), (80, 10), (40, 6)])
+def test_the_newest_row_the_headings_and_the_bar_are_visible(
+    width: int, height: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for i, screen in enumerate(screens(width, height, 30, monkeypatch), start=1):
+        lines = screen.visible
+        assert any(line.split()[:2] == [str(i), str(500 * i)] for line in lines)
+        assert any(line.startswith("iter") for line in lines)
+        assert any(f"{i}/30" in line for line in lines)
+        assert " ".join(NOTE.split()) in " ".join(" ".join(lines).split())
+
+
+def test_all_rows_stay_above_and_no_value_is_cut(monkeypatch: pytest.MonkeyPatch) -> None:
+    *_, screen = screens(40, 20, 30, monkeypatch)
+    rows = [line.split() for line in screen.lines if re.match(r" *\d+ +\d+ ", line)]
+    assert rows == [[str(i), str(500 * i), "-1.234e-06", "0.239", "/", "1"] for i in range(1, 31)]
+    assert sum(line.startswith("iter") for line in screen.lines) < 15
+    assert "…" not in "".join(screen.lines)
+
+
+@pytest.mark.parametrize(
+    ("width", "headings"),
+    [
+        (80, "iter steps reward KL / bound eta ESS gap CPU s"),
+        (40, "iter steps reward KL / bound"),
+        (26, "iter steps reward"),
+    ],
+)
+def test_columns_that_do_not_fit_are_left_out(
+    width: int, headings: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (screen,) = screens(width, 24, 1, monkeypatch)
+    text = " ".join(" ".join(screen.lines).split())
+    assert text.startswith(f"{headings} 1 500 -1.234e-06")
+
+
+def test_a_lost_output_does_not_end_learning(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Full(io.StringIO):
+        def write(self, text: str) -> int:
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(progress, "Console", lambda: Console(file=Full()))
+    with ProgressTable(2) as table:
+        for i in (1, 2):
+            table(SimpleNamespace(exploring=False), report(i))  # type: ignore[arg-type]
+    assert isinstance(table._console.file, Output)
+    assert table._console.file.error is not None
+
+
+def test_in_a_file_each_iteration_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with ProgressTable(2) as table:
+        table(SimpleNamespace(exploring=True), report(1))  # type: ignore[arg-type]
+    first, last = capsys.readouterr().out.splitlines()
+    assert first.startswith("iter 1  steps 500  reward -1.234e-06  KL / bound 0.239 / 1")
+    assert "no state-dependent reward: exploring" in first
+    assert last.startswith("CPU seconds: rollouts 0.1, basis 0.1")
