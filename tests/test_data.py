@@ -96,7 +96,8 @@ def test_a_value_that_is_not_finite_raises_and_its_row_is_named(name: str, bad: 
     ("observations", "actions", "rewards"),
     [
         ((6,), (5, 2), (5,)),
-        ((6, 3), (5,), (5,)),
+        ((6, 3), (4,), (5,)),
+        ((6, 3), (), (5,)),
         ((6, 3), (5, 2), (5, 1)),
         ((6, 3), (5, 2), ()),
         ((5, 3), (5, 2), (5,)),

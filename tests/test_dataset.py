@@ -320,7 +320,7 @@ def test_no_rollout_at_all_raises() -> None:
         {"observations": np.zeros((40, 3))},
         {"observations": np.zeros(39)},
         {"actions": np.zeros((30, 2))},
-        {"actions": np.zeros(31)},
+        {"actions": np.zeros(30)},
         {"rewards": np.zeros(32)},
         {"rewards": np.zeros((31, 1))},
     ],

@@ -8,6 +8,7 @@ same (`kreps.learning.storage`), so that what is learnt can be saved, and what i
 
 from __future__ import annotations
 
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -138,3 +139,29 @@ def as_flag(name: str, value: Any) -> bool:
     if array.size != 1:
         raise DataError(f"{name}: shape {array.shape}, but one flag is needed")
     return bool(array.item())
+
+
+def as_rows(name: str, values: NDArray[Any]) -> NDArray[Any]:
+    """A view of values with one row, or one reward, per step."""
+    least, most = {"observations": (2, np.inf), "actions": (1, np.inf), "rewards": (1, 1)}[name]
+    if not least <= values.ndim <= most:
+        raise DataError(
+            f"{name} of shape {values.shape} do not fit together with the others: "
+            "observations (T + 1, ds), actions (T, da), rewards (T,) are needed, or observations "
+            "and actions in the shapes of the environment"
+        )
+    return values if name == "rewards" else values.reshape(len(values), prod(values.shape[1:]))
+
+
+def ended_by(terminated: Any, steps: int) -> bool:
+    """Whether a rollout of so many steps ended with the last, from one flag or one per step."""
+    each = as_flags("terminated", terminated)
+    if each.size == 1:
+        return bool(each.item())
+    if each.shape != (steps,) or each[:-1].any():
+        raise DataError(
+            f"terminated has shape {each.shape} and is true {np.count_nonzero(each)} times, but "
+            f"one flag is needed, or {steps}, of which only the last may be true; cut the rollout "
+            "where the task ended"
+        )
+    return bool(each[-1])

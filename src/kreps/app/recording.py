@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from kreps.app.environments import metadata_of
 from kreps.errors import EnvironmentFailure, KrepsError
 from kreps.kernels.arrays import FloatArray
-from kreps.learning.environment import Environment
+from kreps.learning.environment import Environment, spaces_of
 from kreps.learning.policy import Policy
 
 Picture = NDArray[np.uint8]
@@ -60,17 +60,15 @@ def record(
         EnvironmentFailure: the environment raised, or draws no pictures.
     """
     frames, observations, actions = [], [], []
-    space = env.action_space
+    spaces = spaces_of(env)
     try:
         observation, _ = env.reset(seed=seed)
         for _ in range(steps):
             frames.append(picture_of(env.render()))  # first: without pictures no step is taken
             observations.append(np.array(observation, dtype=np.float64).ravel())
             action, _ = policy.predict(observations[-1], deterministic=deterministic)
-            actions.append(action)
-            observation, _, terminated, truncated, _ = env.step(
-                action.astype(space.dtype).reshape(space.shape or ())
-            )
+            actions.append(np.ravel(action))
+            observation, _, terminated, truncated, _ = env.step(spaces.actions(actions[-1]))
             if terminated or truncated:
                 break
     except KrepsError:

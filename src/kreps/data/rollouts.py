@@ -12,7 +12,15 @@ import numpy as np
 
 from kreps.data.task import TaskSpec
 from kreps.errors import DataError
-from kreps.intake import as_array, as_flags, as_numbers, first_invalid_row, invalid
+from kreps.intake import (
+    as_array,
+    as_flags,
+    as_numbers,
+    as_rows,
+    ended_by,
+    first_invalid_row,
+    invalid,
+)
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
 
 
@@ -24,8 +32,10 @@ class Rollout:
 
     Attributes:
         observations: (T + 1, ds); row t + 1 is the successor of row t.  The last row is the
-            successor of the last step, observed before any restart.
-        actions: (T, da) as the policy commanded them, before clipping.
+            successor of the last step, observed before any restart.  Observations of more axes are
+            flattened.
+        actions: (T, da) as the policy commanded them, before clipping.  Those of more axes are
+            flattened, and those of one coordinate may be given as (T,).
         rewards: (T,).
         terminated: whether the task ended with the last step.  False if the rollout was only cut
             off, by a restart or a time limit.  It may be given as a flag for each step, (T,).
@@ -41,13 +51,8 @@ class Rollout:
     terminated: bool = False
 
     def __post_init__(self) -> None:
-        for name, dimensions in (("observations", 2), ("actions", 2), ("rewards", 1)):
-            values = as_numbers(name, getattr(self, name), _DROP)
-            if values.ndim != dimensions:
-                raise DataError(
-                    f"{name} have shape {values.shape}, but {dimensions} dimensions are needed: "
-                    "observations (T + 1, ds), actions (T, da), rewards (T,)"
-                )
+        for name in ("observations", "actions", "rewards"):
+            values = as_rows(name, as_numbers(name, getattr(self, name), _DROP))
             object.__setattr__(self, name, _read_only(values))
         steps = len(self.rewards)
         if steps == 0:
@@ -58,7 +63,7 @@ class Rollout:
                 "rewards do not fit together: T rewards need T actions and T + 1 observations "
                 "(the last one is the successor of the last step)"
             )
-        object.__setattr__(self, "terminated", _ended(self.terminated, steps))
+        object.__setattr__(self, "terminated", ended_by(self.terminated, steps))
 
     @classmethod
     def _view(
@@ -150,7 +155,7 @@ class Rollouts(Sequence[Rollout]):
 
         Args:
             observations: (n + R, ds), those of each rollout followed by its last successor.
-            actions: (n, da) as commanded.
+            actions: (n, da) as commanded; shapes as of `Rollout`.
             rewards: (n,).
             lengths: (R,) steps of each rollout.
             terminated: (R,) whether the task ended with its last step; None if none did.
@@ -161,16 +166,16 @@ class Rollouts(Sequence[Rollout]):
             DataError: sizes that do not fit together, NaN, infinities or absurdly large numbers,
                 masked values, numbers or flags that are none.
         """
-        observations = as_array("observations", observations)
-        actions, rewards = as_array("actions", actions), as_array("rewards", rewards)
+        observations = as_rows("observations", as_array("observations", observations))
+        actions = as_rows("actions", as_array("actions", actions))
+        rewards = as_rows("rewards", as_array("rewards", rewards))
         given = np.atleast_1d(as_array("lengths", lengths))
         steps = np.where((given >= 1) & (given <= rewards.size), given, 0).astype(np.intp)
         ended = np.zeros(len(steps), bool)
         if terminated is not None:
             ended = np.atleast_1d(as_flags("terminated", terminated))
         fits = (
-            (observations.ndim, actions.ndim, rewards.ndim) == (2, 2, 1)
-            and steps.ndim == 1
+            steps.ndim == 1
             and ((steps == given) & (steps >= 1)).all()
             and steps.sum() == len(rewards) == len(actions)
             and len(observations) == len(rewards) + len(steps)
@@ -377,20 +382,6 @@ class Transitions:
 
 
 _DROP = "drop the rollout, or cut it before that step"
-
-
-def _ended(terminated: Any, steps: int) -> bool:
-    """Whether a rollout of so many steps ended with the last, from one flag or one per step."""
-    each = as_flags("terminated", terminated)
-    if each.size == 1:
-        return bool(each.item())
-    if each.shape != (steps,) or each[:-1].any():
-        raise DataError(
-            f"terminated has shape {each.shape} and is true {np.count_nonzero(each)} times, but "
-            f"one flag is needed, or {steps}, of which only the last may be true; cut the rollout "
-            "where the task ended"
-        )
-    return bool(each[-1])
 
 
 def _read_only(values: FloatArray) -> FloatArray:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from kreps.data.spaces import Spaces
 from kreps.errors import ConfigurationError, DataError, NumericalError
 from kreps.intake import as_array, is_sane
 from kreps.kernels.arrays import FloatArray
@@ -28,6 +29,8 @@ class TaskSpec:
             A coordinate in no group has its own lengthscale.
         image_shape: (height, width) if the groups are images, each row by row from the top; then
             every coordinate must belong to an image.
+        spaces: how the environment gives observations and takes actions; None: observations (ds,)
+            and actions (da,) of float64.
 
     Raises:
         ConfigurationError: sizes, limits or coordinates that are impossible or contradict each
@@ -40,6 +43,7 @@ class TaskSpec:
     periodic: tuple[int, ...] = ()
     groups: tuple[tuple[int, ...], ...] = ()
     image_shape: tuple[int, int] | None = None
+    spaces: Spaces | None = None
 
     def __post_init__(self) -> None:
         try:
@@ -60,6 +64,11 @@ class TaskSpec:
                 "but a whole number and a list of whole numbers are needed, as 3 and (0, 2)"
             ) from error
         self._check_sizes()
+        if self.spaces is not None and self.spaces.sizes != self.sizes:
+            raise ConfigurationError(
+                f"its spaces have {self.spaces.sizes} coordinates of observations and actions, the "
+                f"task {self.sizes}; leave spaces out, or give those of the environment"
+            )
         self._check_groups()
         if self.image_shape is not None:
             self._check_images(self.image_shape)
@@ -137,6 +146,16 @@ class TaskSpec:
         return len(self.action_low)
 
     @property
+    def sizes(self) -> tuple[int, int]:
+        """``(ds, da)``."""
+        return self.observation_size, self.action_size
+
+    @property
+    def given_spaces(self) -> Spaces:
+        """``spaces``, or those of vectors."""
+        return self.spaces or Spaces((self.observation_size,), (self.action_size,))
+
+    @property
     def action_centre(self) -> FloatArray:
         """Middle of the range (da,)."""
         return 0.5 * (self.action_low + self.action_high)
@@ -157,6 +176,8 @@ class TaskSpec:
     def clip(self, actions: FloatArray) -> FloatArray:
         """The *applied* actions: the commanded ones, clipped to their limits.
 
+        If the environment takes whole numbers, they are rounded to the nearest.
+
         Raises:
             NumericalError: one is NaN or infinite, so that no action can be applied.
         """
@@ -166,7 +187,8 @@ class TaskSpec:
                 "out of range; load another copy of its file, or learn it again with observations "
                 "and rewards in other units"
             )
-        return np.clip(actions, self.action_low, self.action_high)
+        applied = np.clip(actions, self.action_low, self.action_high)
+        return np.rint(applied) if self.spaces and self.spaces.whole_actions else applied
 
     def scaled_applied(self, actions: FloatArray) -> FloatArray:
         """The applied actions of the commanded ones (m, da), in units of the action scale."""

@@ -23,6 +23,7 @@ from kreps.learning.environment import (
     Environment,
     batch_model_of,
     observation_limits,
+    spaces_of,
     time_limit,
 )
 from kreps.policies.base import StochasticPolicy
@@ -254,7 +255,7 @@ def _simulate_one(
     noise: FloatArray,
     number: int,
 ) -> Rollout:
-    space = env.action_space
+    spaces = spaces_of(env)
     observations: list[FloatArray] = []
     actions: list[FloatArray] = []
     rewards: list[float] = []
@@ -265,7 +266,7 @@ def _simulate_one(
         while not (terminated or truncated) and len(rewards) < len(noise):
             state = observations[-1]
             action = policy.act(state[None], noise[len(actions)][None])[0]
-            applied = task.clip(action).astype(space.dtype).reshape(space.shape or ())
+            applied = spaces.actions(task.clip(action))
             observation, reward, ended, cut, _ = env.step(applied)
             observations.append(_state(observation, task))
             actions.append(action)

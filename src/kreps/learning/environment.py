@@ -11,6 +11,7 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 
+from kreps.data.spaces import Spaces
 from kreps.data.task import TaskSpec
 from kreps.envs.batch import BatchModel
 from kreps.errors import ConfigurationError, SpaceError
@@ -91,7 +92,14 @@ def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec
         periodic=tuple(metadata.get(ANGLES, ()) if periodic is None else periodic),
         groups=tuple(metadata.get(GROUPS, ())),
         image_shape=metadata.get(IMAGE_SHAPE),
+        spaces=spaces_of(env),
     )
+
+
+def spaces_of(env: Environment) -> Spaces:
+    """Shapes and numbers of an environment whose spaces are supported."""
+    observations, actions = env.observation_space, env.action_space
+    return Spaces(observations.shape or (), actions.shape or (), str(actions.dtype))
 
 
 def _sizes_and_limits(env: Environment) -> tuple[int, FloatArray, FloatArray]:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from kreps.algorithms.state import LearnerState, UpdateReport
 from kreps.data.dataset import Dataset
@@ -21,7 +22,6 @@ from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError
-from kreps.kernels.arrays import FloatArray
 from kreps.kernels.threads import blas_threads
 from kreps.learning import storage
 from kreps.learning.collect import collect
@@ -307,7 +307,7 @@ class Learner(Generic[MethodSettings]):
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = False,
-    ) -> tuple[FloatArray, Any]:
+    ) -> tuple[NDArray[Any], Any]:
         """`kreps.Policy.predict` of the current policy, with noise of its own after each update."""
         return self.policy.predict(observation, state, episode_start, deterministic)
 

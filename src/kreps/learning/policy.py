@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from kreps.errors import ConfigurationError, DataError
+from kreps.errors import ConfigurationError
 from kreps.intake import as_numbers
-from kreps.kernels.arrays import FloatArray
 from kreps.learning import storage
 from kreps.learning.storage.onnx import write_onnx
 from kreps.policies.base import LearntPolicy
@@ -40,18 +40,21 @@ class Policy:
         state: Any = None,
         episode_start: Any = None,
         deterministic: bool = False,
-    ) -> tuple[FloatArray, Any]:
+    ) -> tuple[NDArray[Any], Any]:
         """Actions for one observation or several, clipped to the task's limits.
 
         Args:
-            observation: (ds,) or (m, ds).
+            observation: one as the environment gives it, or several along a first axis; or one or
+                several that are flattened, (ds,) or (m, ds).
             state, episode_start: accepted for compatibility and not used, as the policy depends on
                 the observation alone.
             deterministic: whether to leave out the exploration noise (the mean of a Gaussian
                 process).
 
         Returns:
-            Action (da,) or actions (m, da) in the task's units, and ``state`` unchanged.
+            Action in the task's units, of the shape and the type of numbers that the environment
+            takes ((da,) of float64 for a `TaskSpec`), or actions along a first axis; and ``state``
+            unchanged.
 
         Raises:
             DataError: another shape, NaN or infinities.
@@ -59,20 +62,15 @@ class Policy:
         """
         task = self.process.task
         remedy = "no action is defined for it, so check the sensors"
-        batch = as_numbers("observations", observation, remedy)
-        if batch.ndim not in (1, 2) or batch.shape[-1] != task.observation_size:
-            raise DataError(
-                f"the observation has shape {batch.shape}, but ({task.observation_size},) or "
-                f"(m, {task.observation_size}) is needed; flatten images first"
-            )
-        states = np.atleast_2d(batch)
+        observations = as_numbers("observations", observation, remedy)
+        states, single = task.given_spaces.states(observations)
         if deterministic:
             commanded = self.process.greedy(states)
         else:
             noise = self._noise.standard_normal((len(states), task.action_size))
             commanded = self.process.act(states, noise)
-        actions = task.clip(commanded)
-        return (actions[0] if batch.ndim == 1 else actions), state
+        applied = task.clip(commanded)
+        return task.given_spaces.actions(applied[0] if single else applied), state
 
     def save(self, path: str | Path) -> None:
         """Write the policy to a file; read it with `kreps.load_policy`."""
@@ -163,7 +161,7 @@ def mean_difference(exact: Policy, compressed: Policy) -> float:
     """
     process = exact.process
     assert isinstance(process, CostSensitiveGP | SparseGP)
-    a, b = (p.predict(process.states, deterministic=True)[0] for p in (exact, compressed))
+    a, b = (process.task.clip(p.process.greedy(process.states)) for p in (exact, compressed))
     return float(np.sqrt(np.mean(((a - b) / process.task.action_scale) ** 2)))
 
 

@@ -229,12 +229,14 @@ class Record:
         nodes: by field.
         given: fields that are not stored, but passed to `decode` as ``given``.
         ranges: smallest and largest possible size by letter.
+        absent: what stands in the header for fields that files of before do not have.
     """
 
     owner: type[Any]
     nodes: Mapping[str, Node]
     given: tuple[str, ...] = ()
     ranges: Mapping[str, tuple[int, int]] = field(default_factory=dict)
+    absent: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         assert {each.name for each in fields(self.owner)} == {*self.nodes, *self.given}
@@ -246,6 +248,7 @@ class Record:
         }
 
     def check(self, header: Any, name: str, layout: Layout, sizes: Sizes) -> None:
+        header = {**self.absent, **header} if isinstance(header, dict) else header
         found = sorted(header) if isinstance(header, dict) else header
         if found != sorted(self.nodes):
             raise StorageError(
@@ -261,6 +264,7 @@ class Record:
                 )
 
     def decode(self, header: Any, name: str, load: Load, given: Mapping[str, Any]) -> Any:
+        header = {**self.absent, **header}
         parts = {
             part: node.decode(header[part], _join(name, part), load, given)
             for part, node in self.nodes.items()

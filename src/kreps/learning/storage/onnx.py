@@ -183,6 +183,8 @@ def _graph_of(policy: SparseGP, helper: Any, border: Number, arithmetic: Number)
         for name, limit in (("action_low", task.action_low), ("action_high", task.action_high))
     )
     action = graph.node("Min", graph.node("Max", commanded, low), high)
+    if task.given_spaces.whole_actions:
+        action = graph.node("Round", action)
     graph.node("Add", action, zero, out="action")
     graph.node("Add", deviation, zero, out="standard_deviation")
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from kreps.data.spaces import Spaces
 from kreps.data.task import TaskSpec
 from kreps.errors import StorageError
 from kreps.kernels.arrays import FloatArray
@@ -24,6 +25,7 @@ from kreps.learning.storage.codec import (
     Node,
     Number,
     OneOf,
+    Optional,
     Plain,
     Record,
     StoredArrays,
@@ -44,7 +46,18 @@ TASK = Record(
         "periodic": Plain(),
         "groups": Plain(),
         "image_shape": Plain(),
+        "spaces": Optional(
+            Record(
+                Spaces,
+                {
+                    "observation_shape": Plain(),
+                    "action_shape": Plain(),
+                    "action_dtype": Plain(),
+                },
+            )
+        ),
     },
+    absent={"spaces": None},
 )
 
 LENGTHSCALES = Limit("between 1e-100 and 1e100", lambda v: (v > 1e-100) & (v < 1e100))
