@@ -212,8 +212,9 @@ def test_a_whole_training_leaves_all_promised_files_and_says_so(
     monkeypatch.chdir(tmp_path)
     code, text = call("train", NAME, "--iterations", "2", "--out", "run", *TINY)
     assert code == 0
-    pictures = {"learning_curve.png", "policy_maps.png", "video.gif"}
-    assert {p.name for p in Path("run").iterdir()} == RUN_FILES | pictures | {"evaluation.json"}
+    pictures = {"learning_curve.png", "policy_maps.png", "trajectories.png", "video.gif"}
+    evaluated = {"evaluation.json", "evaluation_rollouts.safetensors"}
+    assert {p.name for p in Path("run").iterdir()} == RUN_FILES | pictures | evaluated
     for name in pictures:
         with Image.open(Path("run") / name) as picture:
             picture.load()
@@ -451,12 +452,41 @@ def test_plot_draws_with_and_without_an_evaluation(run: Path) -> None:
     for name in ("learning_curve.png", "policy_maps.png"):
         assert name in text.replace(" ", "")
         assert (run / name).stat().st_size > 5000
+    assert f"kreps evaluate {run}" in text and not (run / "trajectories.png").exists()
     without = (run / "learning_curve.png").read_bytes()
     call("evaluate", run, "--episodes", "2", "--steps", "20")
     assert call("plot", run)[0] == 0
     assert (run / "learning_curve.png").read_bytes() != without
+    assert (run / "trajectories.png").stat().st_size > 5000
     call("resume", run, "--iterations", "3", "--no-report")
-    assert call("plot", run)[0] == 0  # the evaluation is of an earlier policy now
+    code, text = call("plot", run)  # the evaluation is of an earlier policy now
+    assert code == 0 and f"kreps evaluate {run}" in text and "trajectories.png" not in text
+
+
+def test_an_evaluation_stores_the_first_rollouts_of_the_greedy_policy(run: Path) -> None:
+    call("evaluate", run, "--episodes", "12", "--steps", "20", "--seed", "4")
+    learner = kreps.KREPS.resume(run / "checkpoint.safetensors")
+    stored = RunFolder(run).evaluation_rollouts(2)
+    assert stored is not None and list(stored.lengths) == [20] * 10
+    for rollout in stored:
+        greedy = learner.policy.process.greedy(rollout.observations[:-1])
+        np.testing.assert_allclose(rollout.actions, greedy, rtol=1e-9, atol=1e-9)
+    assert RunFolder(run).evaluation_rollouts(1) is None  # of another policy
+
+
+def test_drawing_moves_no_environment(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    call("evaluate", run, "--episodes", "2", "--steps", "20")
+    for name in ("step", "reset"):  # a robot would move
+        monkeypatch.setattr(type(gym.make(NAME).unwrapped), name, None)
+    assert call("plot", run)[0] == 0
+    assert (run / "trajectories.png").exists()
+
+
+def test_damaged_rollouts_of_an_evaluation_are_an_error_of_the_library(run: Path) -> None:
+    call("evaluate", run, "--episodes", "2", "--steps", "20")
+    file = run / "evaluation_rollouts.safetensors"
+    file.write_bytes(file.read_bytes()[:-7])
+    assert file.name in rejected("plot", run).replace("\n", "")
 
 
 def test_video_films_as_many_steps_as_asked_for(run: Path, tmp_path: Path) -> None:

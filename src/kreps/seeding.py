@@ -25,6 +25,7 @@ class Purpose(IntEnum):
     PREDICT = 5
     RESTART = 6
     BOOTSTRAP = 7
+    PREDICTION = 8
 
 
 def _sequence(seed: int, purpose: Purpose, indices: tuple[int, ...]) -> np.random.SeedSequence:

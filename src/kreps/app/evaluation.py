@@ -9,10 +9,19 @@ from rich.table import Table
 
 from kreps.app.console import console
 from kreps.app.run_folder import RunFolder
+from kreps.data.rollouts import Rollouts
 from kreps.kernels.threads import blas_threads
-from kreps.learning.evaluate import Evaluation, evaluate, stochastic_and_greedy
+from kreps.learning.evaluate import (
+    Evaluation,
+    discounted_average,
+    evaluation_rollouts,
+    stochastic_and_greedy,
+)
 from kreps.learning.methods import KREPS
-from kreps.learning.storage import write_atomically
+from kreps.learning.storage import save_rollouts, write_atomically
+
+STORED_ROLLOUTS, STORED_NUMBERS = 10, 2_000_000
+"""Largest number of rollouts of the greedy policy that are stored, and of numbers in them."""
 
 
 def evaluate_run(
@@ -20,7 +29,8 @@ def evaluate_run(
 ) -> dict[str, Evaluation]:
     """Average reward per step of the stochastic and the greedy policy.
 
-    The result is printed as a table and written to ``evaluation.json``.
+    The result is printed as a table and written to ``evaluation.json``, and the first rollouts of
+    the greedy policy to ``evaluation_rollouts.safetensors``.
 
     Args:
         folder: of the run.
@@ -33,15 +43,10 @@ def evaluate_run(
     found = {}
     with console.status("evaluating ..."), blas_threads(1):
         for name, policy in stochastic_and_greedy(learner.state.policy).items():
-            found[name] = evaluate(
-                learner.env,
-                learner.task,
-                policy,
-                restart_probability=learner.settings.restart_probability,
-                episodes=episodes,
-                steps=steps,
-                seed=seed,
+            rollouts = evaluation_rollouts(
+                learner.env, learner.task, policy, episodes=episodes, steps=steps, seed=seed
             )
+            found[name] = discounted_average(rollouts, learner.settings.restart_probability)
     table = Table(title=f"Average reward per step, {episodes} rollouts of up to {steps} steps")
     for heading in ("policy", "mean", "± 2 s.e."):
         table.add_column(heading)
@@ -54,5 +59,14 @@ def evaluate_run(
         "seed": seed,
         **{name: asdict(result) for name, result in found.items()},
     }
+    folder.remove_evaluation_rollouts()  # never those of another policy beside this evaluation
     write_atomically(folder.evaluation_file, (json.dumps(content, indent=2) + "\n").encode())
+    save_rollouts(_stored(rollouts), folder.rollouts_file)  # of the greedy policy, the last one
     return found
+
+
+def _stored(rollouts: Rollouts) -> Rollouts:
+    """The first rollouts, fewer where an observation has many numbers, but at least one."""
+    numbers = rollouts.points.shape[1] + rollouts.actions.shape[1] + 1
+    fitting = STORED_NUMBERS // (numbers * int(rollouts.lengths.max()))
+    return rollouts[: max(1, min(STORED_ROLLOUTS, fitting))]

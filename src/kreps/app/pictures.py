@@ -6,16 +6,19 @@ Matplotlib is imported only where a picture is drawn, so that other commands sta
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import ceil
 from pathlib import Path
 
-from kreps.app.console import console
+from kreps.app.console import console, say
 from kreps.app.diagnosis import Finding
 from kreps.app.environments import (
+    Labels,
     environment_of,
     labels_of,
     metadata_of,
     references_of,
 )
+from kreps.app.prediction import predicted_states
 from kreps.app.recording import record
 from kreps.app.run_folder import RunFolder
 from kreps.errors import ConfigurationError
@@ -24,9 +27,14 @@ from kreps.learning.methods import KREPS
 from kreps.learning.policy import Policy
 from kreps.learning.wrappers import Environment
 
+SHOWN_LENGTHS = 2.0
+"""Steps over which rollouts are drawn, in mean lengths of a training rollout."""
+
 
 def draw_run(folder: RunFolder, learner: KREPS) -> list[Path]:
-    """Draw the learning curve and, for two-dimensional states, the maps of the policy and of V.
+    """Draw the learning curve, evaluated rollouts over time, and maps for two-dimensional states.
+
+    The rollouts are those of the latest evaluation, so the environment does not move.
 
     Raises:
         ConfigurationError: the run has no iteration yet.
@@ -41,11 +49,29 @@ def draw_run(folder: RunFolder, learner: KREPS) -> list[Path]:
     with console.status("drawing ..."):
         curve = learning_curve(rows, references_of(config), evaluation, config.environment)
         drawn = [plotting.save(curve, folder.path / "learning_curve.png")]
+        labels = labels_of(learner.env, learner.task)
+        drawn += _draw_trajectories(folder, learner, labels)
         if learner.task.observation_size == 2:
-            labels = labels_of(learner.env, learner.task)
             maps = policy_maps(learner.state, learner.task, labels)
             drawn.append(plotting.save(maps, folder.path / "policy_maps.png"))
     return drawn
+
+
+def _draw_trajectories(folder: RunFolder, learner: KREPS, labels: Labels) -> list[Path]:
+    from kreps import plotting
+    from kreps.app.plots.trajectories import trajectories
+
+    rollouts = folder.evaluation_rollouts(learner.state.iteration)
+    if rollouts is None:
+        say(f"no rollouts to draw over time: `kreps evaluate {folder.path}` records them")
+        return []
+    rollouts.check(learner.task)
+    longest = float(rollouts.lengths.max())
+    steps = ceil(min(SHOWN_LENGTHS / learner.settings.restart_probability, longest))
+    predicted = predicted_states(learner, rollouts[0].observations[0], steps)
+    title = f"{folder.config().environment}, iteration {learner.state.iteration}"
+    figure = trajectories(rollouts, predicted, steps, learner.policy.process, labels, title)
+    return [plotting.save(figure, folder.path / "trajectories.png")]
 
 
 def film_run(

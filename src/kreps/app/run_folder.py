@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any
 
 from kreps.app.progress_file import progress_row, progress_text, read_progress
+from kreps.data.rollouts import Rollouts
 from kreps.errors import ConfigurationError, StorageError
 from kreps.learning.learner import IterationReport
 from kreps.learning.methods import KREPS
-from kreps.learning.storage import save_policy, write_atomically
+from kreps.learning.storage import load_rollouts, save_policy, write_atomically
 from kreps.legacy import present_preset, present_settings
 from kreps.versions import versions
 
@@ -55,6 +56,7 @@ class RunFolder:
         self.checkpoint_file = self.path / "checkpoint.safetensors"
         self.policy_file = self.path / "policy.safetensors"
         self.evaluation_file = self.path / "evaluation.json"
+        self.rollouts_file = self.path / "evaluation_rollouts.safetensors"
 
     def create(self, config: RunConfig) -> None:
         """Start a run here.
@@ -142,6 +144,29 @@ class RunFolder:
         except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
             raise StorageError(
                 f"{self.evaluation_file} is damaged ({error}); remove it, or evaluate again"
+            ) from error
+
+    def evaluation_rollouts(self, iteration: int) -> Rollouts | None:
+        """Rollouts of the greedy policy of an iteration, if it was evaluated; otherwise None.
+
+        Raises:
+            StorageError: a file is damaged.
+        """
+        if self.evaluation(iteration) is None or not self.rollouts_file.exists():
+            return None
+        return load_rollouts(self.rollouts_file)
+
+    def remove_evaluation_rollouts(self) -> None:
+        """Remove the rollouts of an earlier evaluation, if there are any.
+
+        Raises:
+            StorageError: they cannot be removed.
+        """
+        try:
+            self.rollouts_file.unlink(missing_ok=True)
+        except OSError as error:
+            raise StorageError(
+                f"cannot replace {self.rollouts_file}: {error}; check the folder"
             ) from error
 
     def __call__(self, learner: KREPS, report: IterationReport) -> None:

@@ -211,6 +211,31 @@ class ModelEnv:
         )
         return [ModelRollouts(*parts) for parts in zip(*each, strict=True)]
 
+    def trajectories(
+        self, policy: StochasticPolicy, starts: FloatArray, steps: int, rng: np.random.Generator
+    ) -> FloatArray:
+        """States (steps + 1, m, ds) of rollouts without restarts, NaN after the end of an episode.
+
+        Angles count whole turns.
+
+        Args:
+            policy: that acts.
+            starts: (m, ds) first states.
+            steps: of each rollout.
+            rng: of the noise of policy and dynamics, and of ends.
+        """
+        visited = np.full((steps + 1, *starts.shape), np.nan)
+        visited[0] = starts
+        going = np.arange(len(starts))
+        for t in range(steps):
+            noise = RolloutNoise.sample(len(going), self.task.action_size, rng)
+            step = self._step(policy.act, visited[t, going], noise)
+            going, successors = going[~step.terminated], step.successors[~step.terminated]
+            if not len(going):
+                break
+            visited[t + 1, going] = successors
+        return visited
+
     def _step(
         self,
         act: Callable[[FloatArray, FloatArray], FloatArray],

@@ -41,7 +41,11 @@ def evaluate(
 
 
 def plot(run: RunArgument) -> None:
-    """Draw the learning curve and, for two-dimensional states, maps of the policy and of V."""
+    """Draw the learning curve, the evaluated rollouts, and maps for two-dimensional states.
+
+    The rollouts are those that [bold]kreps evaluate[/bold] recorded, so the environment does not
+    move.
+    """
     folder = RunFolder(run)
     with learnt(folder) as learner:
         drawn = draw_run(folder, learner)

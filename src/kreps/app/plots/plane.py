@@ -10,9 +10,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.cm import ScalarMappable
 from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, MultipleLocator
 
 from kreps.algorithms.state import LearnerState
 from kreps.data.task import TaskSpec
@@ -136,8 +138,23 @@ def label_axes(axes: Axes, task: TaskSpec, labels: Sequence[str]) -> None:
     axes.set_xlabel(labels[0])
     axes.set_ylabel(labels[1])
     if 0 in task.periodic:
-        ticks = np.arange(-4, 5) * np.pi / 2
-        names = ["-2π", "-3π/2", "-π", "-π/2", "0", "π/2", "π", "3π/2", "2π"]
-        low, high = axes.get_xlim()
-        inside = [i for i, t in enumerate(ticks) if low - 1e-9 <= t <= high + 1e-9]
-        axes.set_xticks(ticks[inside], [names[i] for i in inside])
+        angle_ticks(axes.xaxis, 4)
+
+
+def angle_ticks(axis: Axis, count: int) -> None:
+    """About so many ticks at multiples of pi / 2, if the axis is long enough for two of them."""
+    length = np.ptp(axis.get_view_interval())
+    if length < np.pi:
+        return
+    step = max(1, round(2.0 * length / np.pi / count))
+    axis.set_major_locator(MultipleLocator(step * np.pi / 2))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: half_turns(value)))
+
+
+def half_turns(angle: float) -> str:
+    """A multiple of pi / 2, such as ``"-π/2"``."""
+    count = round(angle / (np.pi / 2))
+    if count == 0:
+        return "0"
+    number, divided = (count, "/2") if count % 2 else (count // 2, "")
+    return f"{'-' if number < 0 else ''}{abs(number) if abs(number) > 1 else ''}π{divided}"

@@ -51,11 +51,11 @@ def policy_maps(state: LearnerState, task: TaskSpec, labels: Labels) -> Figure:
     mean = np.clip(state.policy.greedy(states)[:, 0], low, high)
     std = state.policy.standard_deviation(states)[:, 0]
     value = state.value(states)
-    known = value[visible.ravel() == 1.0]  # V may be anything where there are no data
+    known = visible.ravel() == 1.0  # elsewhere the values may be of any size
     panels = (
         ("Policy mean", mean, "RdBu_r", (low, high), labels.actions[0]),
-        ("Policy standard deviation", std, "viridis", (0.0, std.max()), labels.actions[0]),
-        ("Value function V", value, "magma", (known.min(), known.max()), "reward"),
+        ("Policy standard deviation", std, "viridis", (0.0, std[known].max()), labels.actions[0]),
+        ("Value function V", value, "magma", (value[known].min(), value[known].max()), "reward"),
     )
     with rc_context(STYLE):
         figure = Figure(figsize=(8.4, 4.2))
