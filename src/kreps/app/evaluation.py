@@ -20,7 +20,7 @@ from kreps.learning.evaluate import (
 from kreps.learning.methods import KREPS
 from kreps.learning.storage import save_rollouts, write_atomically
 
-STORED_ROLLOUTS, STORED_NUMBERS = 10, 2_000_000
+STORED_ROLLOUTS, STORED_NUMBERS = 10, 500_000
 """Largest number of rollouts of the greedy policy that are stored, and of numbers in them."""
 
 
