@@ -327,7 +327,7 @@ def test_resuming_in_another_environment_raises(
     method: str, learnt: dict[str, Learner[Any]], tmp_path: Path
 ) -> None:
     learnt[method].save(tmp_path / "x")
-    with pytest.raises(ConfigurationError, match="resume in the environment of the checkpoint"):
+    with pytest.raises(ConfigurationError, match="give the environment of the checkpoint"):
         LEARNERS[method].resume(tmp_path / "x", gym.make("Pendulum-v1"))
 
 
@@ -383,7 +383,7 @@ def test_settings_out_of_range_raise_with_their_name(method: str, name: str, val
 def test_the_limits_of_the_noise_fraction_are_valid(fraction: int) -> None:
     learner = make_learner("npalp", noise_fraction=fraction).learn(2, progress=False)
     actions, _ = learner.predict(np.tile([[0.4]], (100, 1)))
-    assert (len(np.unique(actions)) > 50) == (fraction == 1)
+    assert (len(np.unique(actions)) > 20) == (fraction == 1)
 
 
 # ---- the grid ---------------------------------------------------------------------------------
