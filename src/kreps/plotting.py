@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+if "MPLBACKEND" in os.environ:  # one that Matplotlib does not know would end its import
+    _backend = os.environ.pop("MPLBACKEND")
+    import matplotlib
+
+    with suppress(ValueError):  # pictures in files need none
+        matplotlib.rcParams["backend"] = _backend
+        os.environ["MPLBACKEND"] = _backend
+
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg

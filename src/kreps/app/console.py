@@ -106,4 +106,5 @@ def _format_warning(
     message: Warning | str, category: Any, filename: str, lineno: int, line: str | None = None
 ) -> str:
     """A warning without the place in the code, and without the colours that Gymnasium adds."""
-    return f"warning: {printable(Text.from_ansi(str(message)).plain)}\n"
+    text = Text.from_ansi(str(message)).plain
+    return f"{_broken(Console(stderr=True), f'warning: {text}')}\n"

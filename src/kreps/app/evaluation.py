@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict
 
 from rich.table import Table
 
-from kreps.app.console import console
+from kreps.app.console import console, say
 from kreps.app.run_folder import RunFolder
 from kreps.data.rollouts import Rollouts
 from kreps.kernels.threads import blas_threads
@@ -25,19 +26,18 @@ STORED_ROLLOUTS, STORED_NUMBERS = 10, 500_000
 
 
 def evaluate_run(
-    folder: RunFolder, learner: KREPS, episodes: int, steps: int, seed: int
-) -> dict[str, Evaluation]:
+    learner: KREPS, episodes: int, steps: int, seed: int
+) -> tuple[dict[str, Evaluation], Rollouts]:
     """Average reward per step of the stochastic and the greedy policy.
 
-    The result is printed as a table and written to ``evaluation.json``, and the first rollouts of
-    the greedy policy to ``evaluation_rollouts.safetensors``.
-
     Args:
-        folder: of the run.
         learner: with an environment and at least one update.
         episodes: rollouts per policy.
         steps: largest length of each, without restarts.
         seed: of the evaluation.
+
+    Returns:
+        The evaluation by policy, and the rollouts of the greedy policy.
     """
     assert learner.env is not None and learner.state.policy is not None
     found = {}
@@ -47,12 +47,33 @@ def evaluate_run(
                 learner.env, learner.task, policy, episodes=episodes, steps=steps, seed=seed
             )
             found[name] = discounted_average(rollouts, learner.settings.restart_probability)
-    table = Table(title=f"Average reward per step, {episodes} rollouts of up to {steps} steps")
-    for heading in ("policy", "mean", "± 2 s.e."):
+    return found, rollouts  # of the greedy policy, the last one
+
+
+def say_evaluation(found: Mapping[str, Evaluation]) -> None:
+    """Print an evaluation as a table."""
+    first = next(iter(found.values()))
+    say(f"Average reward per step, {first.episodes} rollouts of up to {first.steps} steps:")
+    table = Table()
+    for heading in ("policy", "mean", "2 s.e."):
         table.add_column(heading)
     for name, result in found.items():
-        table.add_row(name, f"{result.mean:.4f}", f"{2 * result.standard_error:.4f}")
+        table.add_row(name, f"{result.mean:.5g}", f"{2 * result.standard_error:.2g}")
     console.print(table)
+
+
+def write_evaluation(
+    folder: RunFolder,
+    learner: KREPS,
+    found: Mapping[str, Evaluation],
+    rollouts: Rollouts,
+    seed: int,
+) -> None:
+    """Write an evaluation of the learner's policy.
+
+    It is written to ``evaluation.json``, and the first rollouts of the greedy policy to
+    ``evaluation_rollouts.safetensors``.
+    """
     content = {
         "iteration": learner.state.iteration,
         "environment_steps": learner.state.steps,
@@ -61,8 +82,7 @@ def evaluate_run(
     }
     folder.remove_evaluation_rollouts()  # never those of another policy beside this evaluation
     write_atomically(folder.evaluation_file, (json.dumps(content, indent=2) + "\n").encode())
-    save_rollouts(_stored(rollouts), folder.rollouts_file)  # of the greedy policy, the last one
-    return found
+    save_rollouts(_stored(rollouts), folder.rollouts_file)
 
 
 def _stored(rollouts: Rollouts) -> Rollouts:

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 from kreps.algorithms.dual import Outcome
-from kreps.app.console import say
+from kreps.app.console import say, say_command
 from kreps.app.diagnosis import Finding, diagnose
 from kreps.app.diagnosis.columns import all_recorded
 from kreps.app.environments import references_of
-from kreps.app.evaluation import evaluate_run
+from kreps.app.evaluation import evaluate_run, write_evaluation
 from kreps.app.pictures import draw_run, film_run
 from kreps.app.run_folder import RunFolder
-from kreps.errors import ConfigurationError, EnvironmentFailure
+from kreps.errors import KrepsError
 from kreps.learning.environment import batch_model_of
 from kreps.learning.evaluate import EPISODES, STEPS, Evaluation
 from kreps.learning.methods import KREPS
@@ -22,52 +23,97 @@ from kreps.learning.methods import KREPS
 SHORT_EVALUATION = 10, 200
 """Episodes and steps where the environment has no batch model and its steps may be slow."""
 
+LABEL = 11
+"""Characters of the labels at the start of lines."""
+
 SHOWN_FINDINGS = 3
 """Findings printed at the end of a run; `kreps diagnose` prints all."""
 
 
 def evaluate_at_end(folder: RunFolder, learner: KREPS) -> dict[str, Evaluation]:
-    """Evaluate the policy at the end of its training, in the environment it was learnt in."""
+    """Evaluate the policy at the end of its training, in the environment it was learnt in.
+
+    Returns:
+        The evaluation of both policies; empty if it failed, which is printed.
+    """
     assert learner.env is not None
     episodes, steps = EPISODES, STEPS
     if batch_model_of(learner.env) is None:
         episodes, steps = SHORT_EVALUATION
         say(f"a short evaluation; `kreps evaluate {folder.path}` makes a full one")
-    return evaluate_run(folder, learner, episodes, steps, seed=0)
+    measured = _attempt("evaluation", lambda: evaluate_run(learner, episodes, steps, seed=0))
+    if measured is None:
+        return {}
+    _attempt("evaluation.json", lambda: write_evaluation(folder, learner, *measured, seed=0))
+    return measured[0]
 
 
 def report_run(folder: RunFolder, learner: KREPS, evaluation: Mapping[str, Evaluation]) -> None:
-    """Draw the pictures, and print a summary with the main findings.
+    """Print the main findings and a summary, then draw the pictures.
+
+    The pictures come last, and none of them ends the report: code of the environment draws, which
+    may fail, wait or end the program.
 
     Args:
         folder: of the run.
         learner: its environment should be closed already, as another one is made for the film.
-        evaluation: of its policy.
+        evaluation: of its policy; may be empty.
     """
-    pictures = draw_run(folder, learner)
-    try:
-        pictures.append(film_run(folder, learner))
-    except (ConfigurationError, EnvironmentFailure) as error:
-        say(f"no film: {error}")
+    _attempt("findings", lambda: say_main_findings(folder))
     _say_summary(folder, learner, evaluation)
-    say_main_findings(folder)
-    _say_files(folder, pictures)
-    say(f"Continue:  kreps resume {folder.path} --iterations {2 * learner.state.iteration}")
+    say_command("Policy:    ", f"{folder.policy_file}  (kreps.load_policy reads it)")
+    say_command("Numbers:   ", f"{folder.progress_file}, {folder.evaluation_file}")
+    more = 2 * learner.state.iteration
+    say_command("Continue:  ", f"kreps resume {folder.path} --iterations {more}")
+    _attempt("pictures", lambda: _say_pictures(draw_run(folder, learner)))
+    _attempt("film", lambda: _say_pictures([film_run(folder, learner)]))
+
+
+Result = TypeVar("Result")
+
+
+def _attempt(what: str, part: Callable[[], Result]) -> Result | None:
+    """A part of the report; if it fails, that is printed, and the other parts are made."""
+    try:
+        return part()
+    except KrepsError as error:
+        say(f"no {what}: {error}")
+    except (Exception, SystemExit) as error:  # whatever foreign code raises
+        say(f"no {what}: {type(error).__name__}: {error}")
+    return None
+
+
+def _say_pictures(paths: Iterable[Path]) -> None:
+    for path in paths:
+        say_command("Picture:   ", str(path))
 
 
 def _say_summary(folder: RunFolder, learner: KREPS, evaluation: Mapping[str, Evaluation]) -> None:
-    state, greedy = learner.state, evaluation["greedy"].mean
-    say(
+    state, rows = learner.state, folder.rows()
+    text = (
         f"\n{state.iteration} updates from {state.rollouts} rollouts "
-        f"({state.steps} environment steps). The learnt policy earns {greedy:.4g} per step "
-        f"without noise and {evaluation['stochastic'].mean:.4g} with it."
-        + compared(greedy, references_of(folder.config()))
+        f"({state.steps} environment steps)."
     )
-    last = folder.rows()[-1]
-    say(
-        f"Last update {Outcome[last['outcome']]} (KL {float(last['kl']):.3f} of at most "
-        f"{float(last['kl_bound']):g} nats, duality gap {float(last['gap']):.0e})."
-    )
+    if evaluation:
+        greedy, stochastic = evaluation["greedy"], evaluation["stochastic"]
+        text += (
+            f" The learnt policy earns {_with_error(greedy)} per step without noise and "
+            f"{_with_error(stochastic)} with it (± 2 standard errors)."
+            + compared(greedy.mean, references_of(folder.config()))
+        )
+    elif rows:
+        text += f" The last training rollouts earned {float(rows[-1]['average_reward']):.4g}."
+    say(text)
+    if rows:
+        last = rows[-1]
+        say(
+            f"Last update {Outcome[last['outcome']]} (KL {float(last['kl']):.3f} of at most "
+            f"{float(last['kl_bound']):g} nats, duality gap {float(last['gap']):.0e})."
+        )
+
+
+def _with_error(result: Evaluation) -> str:
+    return f"{result.mean:.4g} ± {2 * result.standard_error:.2g}"
 
 
 def compared(reward: float, references: Mapping[str, float]) -> str:
@@ -81,13 +127,6 @@ def compared(reward: float, references: Mapping[str, float]) -> str:
         f" That is {way:.0%} of the way from {worst_name} ({worst:g}) "
         f"to the {best_name} ({best:g})."
     )
-
-
-def _say_files(folder: RunFolder, pictures: Sequence[Path]) -> None:
-    say(f"Policy:    {folder.policy_file}  (kreps.load_policy reads it)")
-    say(f"Numbers:   {folder.progress_file}, {folder.evaluation_file}")
-    for path in pictures:
-        say(f"Picture:   {path}")
 
 
 # ---- findings ---------------------------------------------------------------------------------
@@ -107,9 +146,10 @@ def diagnosis_of(folder: RunFolder) -> list[Finding]:
 
 def say_finding(finding: Finding) -> None:
     """Print a finding and its remedy."""
-    say(f"{finding.severity.capitalize() + ':':<11}{finding.name}. {finding.sentence}")
+    label = f"{finding.severity.capitalize()}:"
+    say(f"{label:<{LABEL}}{finding.name}. {finding.sentence}", indent=LABEL)
     if finding.remedy:
-        say(f"{'':<11}Try: {finding.remedy}")
+        say(f"{'':<{LABEL}}Try: {finding.remedy}", indent=LABEL)
 
 
 def say_main_findings(folder: RunFolder) -> None:
@@ -118,7 +158,7 @@ def say_main_findings(folder: RunFolder) -> None:
     for finding in findings[:SHOWN_FINDINGS]:
         say_finding(finding)
     if findings:
-        say(f"All findings on one page: kreps diagnose {folder.path}")
+        say_command("All findings on one page: ", f"kreps diagnose {folder.path}")
     else:
         say(f"No finding limits this run (kreps diagnose {folder.path}).")
 

@@ -8,8 +8,8 @@ from typing import Annotated
 import typer
 
 from kreps.app.cli.runs import RunArgument, learnt, require_checkpoint
-from kreps.app.console import say
-from kreps.app.evaluation import evaluate_run
+from kreps.app.console import say_command
+from kreps.app.evaluation import evaluate_run, say_evaluation, write_evaluation
 from kreps.app.pictures import draw_diagnosis, draw_run, film_run
 from kreps.app.report import say_diagnosis
 from kreps.app.run_folder import RunFolder
@@ -37,7 +37,9 @@ def evaluate(
     """Measure the average reward per step of the policy, with and without exploration noise."""
     folder = RunFolder(run)
     with learnt(folder) as learner:
-        evaluate_run(folder, learner, episodes, steps, seed)
+        found, rollouts = evaluate_run(learner, episodes, steps, seed)
+    say_evaluation(found)
+    write_evaluation(folder, learner, found, rollouts, seed)
 
 
 def plot(run: RunArgument) -> None:
@@ -50,7 +52,7 @@ def plot(run: RunArgument) -> None:
     with learnt(folder) as learner:
         drawn = draw_run(folder, learner)
     for path in drawn:
-        say(f"drew {path}")
+        say_command("drew ", str(path))
 
 
 def diagnose(
@@ -68,14 +70,15 @@ def diagnose(
     [bold]fine[/bold]: it does not.  Only the files of the run are read, so no environment is
     needed.  After an evaluation the cost of the exploration noise is included.
     """
-    from kreps.app.diagnosis_page import check_page_name  # imports Matplotlib
+    from kreps import plotting  # noqa: F401  (first, as it makes Matplotlib importable)
+    from kreps.app.diagnosis_page import check_page_name
 
     folder = RunFolder(run)
     folder.config()  # an error if this is not a run folder
     out = out or folder.path / "diagnosis.png"
     check_page_name(out)
     findings = say_diagnosis(folder)
-    say(f"drew {draw_diagnosis(folder, findings, out)}")
+    say_command("drew ", str(draw_diagnosis(folder, findings, out)))
 
 
 def video(
@@ -92,4 +95,4 @@ def video(
     require_checkpoint(folder)
     learner = KREPS.resume(folder.checkpoint_file)
     path = film_run(folder, learner, steps, stochastic=stochastic, seed=seed, out=out)
-    say(f"filmed {path}")
+    say_command("filmed ", str(path))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from kreps.app.console import say
+from kreps.app.console import say_command
 from kreps.errors import ConfigurationError
 from kreps.experiments.claims import write_claims
 from kreps.experiments.executors import executor
@@ -80,14 +80,14 @@ def reproduce(
             results = run_trials(all_trials, pool, out / "trials")
     for name in figures:
         if name in PICTURES:
-            say(f"drew {draw_features(out / f'{name}.png')}")
+            say_command("drew ", str(draw_features(out / f"{name}.png")))
             continue
         names = {trial.name for trial in planned[name]}
         chosen = [result for result in results if name_of(result) in names]
         for path in write_figure(out, name, command, chosen):
-            say(f"wrote {path}")
+            say_command("wrote ", str(path))
     for path in write_claims(out):
-        say(f"wrote {path}")
+        say_command("wrote ", str(path))
 
 
 def search(
@@ -118,4 +118,5 @@ def search(
     with executor(workers, scheduler) as pool:
         results = run_trials(all_trials, pool, out / "trials" / "search")
     command = " ".join(["kreps search", *(tasks or ())])
-    say(f"wrote {write_search(out / 'search.json', command, tasks or list(CANDIDATES), results)}")
+    path = write_search(out / "search.json", command, tasks or list(CANDIDATES), results)
+    say_command("wrote ", str(path))

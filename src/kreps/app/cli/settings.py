@@ -10,14 +10,16 @@ from dataclasses import fields, is_dataclass
 from typing import Annotated, Any
 
 import typer
-from rich.table import Table
 
-from kreps.app.console import console
+from kreps.app.console import say
 from kreps.errors import ConfigurationError
 from kreps.presets import PRESETS, SECTIONS, flat, settings_of
 from kreps.settings import LearnerSettings, Settings
 
 SETTINGS_EXAMPLES = ("kreps settings", "kreps settings --preset paper")
+
+INDENT = 4
+"""Of the meaning of a setting, below its name."""
 
 
 def parse_setting(text: str, option: str = "--set") -> tuple[str, Any]:
@@ -87,13 +89,11 @@ def settings(
     """List all settings with their values in a preset and their meaning."""
     chosen = settings_of(preset)
     values = flat(chosen)
-    table = Table(title=f"Settings of the preset {preset}, for --set NAME=VALUE")
-    for heading in ("name", "value", "meaning"):
-        table.add_column(heading, overflow="fold")
+    say(f"Settings of the preset {preset}, for --set NAME=VALUE\n")
     for name, text in _all_descriptions(chosen):
         value = values.get(name, "")
-        table.add_row(name, "none" if value is None else str(value), text)
-    console.print(table, markup=False)
+        say(name if value == "" else f"{name} = {'none' if value is None else value}")
+        say(f"{'':<{INDENT}}{text}", indent=INDENT)
 
 
 def _all_descriptions(chosen: LearnerSettings) -> Iterator[tuple[str, str]]:

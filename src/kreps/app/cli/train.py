@@ -11,11 +11,11 @@ import typer
 
 from kreps.app.cli.runs import RunArgument
 from kreps.app.cli.settings import parse_setting
-from kreps.app.console import say
+from kreps.app.console import say, say_command
 from kreps.app.environments import environment_of
 from kreps.app.report import evaluate_at_end, report_run
 from kreps.app.run_folder import RunConfig, RunFolder
-from kreps.errors import ConfigurationError, EnvironmentFailure
+from kreps.errors import ConfigurationError, KrepsError
 from kreps.learning.environment import Environment
 from kreps.learning.evaluate import Evaluation
 from kreps.learning.methods import KREPS
@@ -144,21 +144,20 @@ def _learn(
     try:
         if left > 0:
             learner.learn(left, callback=folder)
+        return evaluate_at_end(folder, learner) if report else None
     except KeyboardInterrupt:
-        say(
-            f"\nstopped after {learner.state.iteration} of {target} updates; "
-            f"continue with: kreps resume {folder.path}"
-        )
+        say(f"\nstopped after {learner.state.iteration} of {target} updates; continue with:")
+        say_command("  ", f"kreps resume {folder.path}")
         raise typer.Exit(130) from None
-    except EnvironmentFailure:
-        say(f"after repairing the environment, continue with: kreps resume {folder.path}")
+    except KrepsError:  # of the environment, or a disk that is full
+        say("once the cause of the error below is removed, continue with:")
+        say_command("  ", f"kreps resume {folder.path}")
         raise
-    return evaluate_at_end(folder, learner) if report else None
 
 
 def _finish(folder: RunFolder, learner: KREPS, evaluation: Mapping[str, Evaluation] | None) -> None:
     """Report a run whose environment is closed."""
     if evaluation is None:
-        say(f"policy: {folder.policy_file}")
+        say_command("policy: ", str(folder.policy_file))
     else:
         report_run(folder, learner, evaluation)

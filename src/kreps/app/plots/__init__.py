@@ -1,1 +1,3 @@
 """Pictures of one run."""
+
+from kreps import plotting  # noqa: F401  (first, as it makes Matplotlib importable in any case)
