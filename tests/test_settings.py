@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -352,6 +353,64 @@ def test_a_value_out_of_range_is_refused_by_name(name: str) -> None:
         assert "must be" in str(caught.value) or "choose one of" in str(caught.value)
 
 
+TOO_FAR: dict[str, list[Any]] = {
+    "restart_probability": [1e-300, 1e-12, 9e-10],
+    "window": [10**15 + 1],
+    "initial_rollouts": [100_001],
+    "rollouts_per_iteration": [100_001],
+    "kl_bound": [],
+    "ridge": [],
+    "eta_floor": [],
+    "exploration.scale": [],
+    "value.max_rank": [10**15 + 1],
+    "value.tolerance": [1.0, 1, 1e300],
+    "low_rank.rank": [10**15 + 1],
+    "low_rank.above": [10**15 + 1],
+    "low_rank.subsample": [10**15 + 1],
+    "model_based.actions_per_state": [10_000_001],
+    "model_based.proposal_std_scale": [1000.1, 1e300],
+    "model_based.acceptance_rollouts": [100_001, 10**9],
+    "model_based.exploration_bonus": [],
+    "model_based.max_samples": [10_000_001],
+}
+"""Besides whole numbers of 400 and of 5000 digits."""
+
+
+@pytest.mark.parametrize("name", TOO_FAR)
+def test_what_no_computer_could_compute_is_refused_by_name(name: str) -> None:
+    for value in (*TOO_FAR[name], 10**400, 10**5000):
+        with pytest.raises(ConfigurationError) as caught:
+            settings_of("model_based", **{name: value})
+        assert str(caught.value).startswith(f"{name} = ")
+        assert len(str(caught.value)) < 200
+
+
+@pytest.mark.parametrize("name", ["seed", "threads"])
+def test_numbers_of_learners_have_at_most_128_bits(name: str) -> None:
+    task = kreps.TaskSpec(1, [-1.0], [1.0])
+    assert getattr(kreps.KREPS(task, **{name: 2**128 - 1}), name) == 2**128 - 1
+    for value in (2**128, 10**400, 10**5000):
+        with pytest.raises(ConfigurationError, match=f"{name} = .*128 bits"):
+            kreps.KREPS(task, **{name: value})
+
+
+def test_a_seed_of_128_bits_survives_a_checkpoint(tmp_path: Path) -> None:
+    kreps.KREPS(kreps.TaskSpec(1, [-1.0], [1.0]), seed=2**128 - 1).save(tmp_path / "x")
+    assert kreps.KREPS.resume(tmp_path / "x").seed == 2**128 - 1
+
+
+def test_an_update_without_enough_memory_is_an_error_of_the_library(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def too_large(*_: Any) -> Any:
+        raise MemoryError("Unable to allocate 14.6 TiB")
+
+    learner = kreps.KREPS(kreps.TaskSpec(1, [-1.0], [1.0]))
+    monkeypatch.setattr(learner, "_updated", too_large)
+    with pytest.raises(ConfigurationError, match=r"needs more memory than there is .*lower"):
+        learner.update([kreps.Rollout(np.zeros((3, 1)), np.zeros((2, 1)), np.zeros(2))])
+
+
 @pytest.mark.parametrize("value", NO_COUNTS)
 def test_the_size_of_a_grid_is_a_count(value: Any) -> None:
     with pytest.raises(ConfigurationError, match=r"value\.size = "):
@@ -360,8 +419,8 @@ def test_the_size_of_a_grid_is_a_count(value: Any) -> None:
 
 AT_THE_EDGE: dict[str, list[Any]] = {
     "restart_probability": [1e-9, 0.999],
-    "window": [None, 1],
-    "initial_rollouts": [1],
+    "window": [None, 1, 10**15],
+    "initial_rollouts": [1, 100_000],
     "exploration.scale": [1e-9],
     "kl_bound": [2, 1e-9],
     "eta_floor": [None, 0, 0.0],
@@ -372,7 +431,7 @@ AT_THE_EDGE: dict[str, list[Any]] = {
     "value.max_rank": [1],
     "low_rank.above": [0],
     "model_based.actions_per_state": [1],
-    "model_based.proposal_std_scale": [1, 2.5],
+    "model_based.proposal_std_scale": [1, 2.5, 1000],
     "model_based.model_rollout_fraction": [0, 1.0],
     "model_based.acceptance_rollouts": [0, 2],
     "model_based.exploration_bonus": [0, 10.0],
@@ -409,8 +468,11 @@ def test_without_a_learnt_model_there_are_no_generated_samples(changes: dict[str
 
 @pytest.mark.parametrize(
     ("changes", "names"),
-    [({"temperature": value}, "temperature") for value in (0.0, -1.0, *NOT_FINITE, "1", None)]
-    + [({"actions": value}, "actions") for value in NO_COUNTS],
+    [
+        ({"temperature": value}, "temperature")
+        for value in (0.0, -1.0, *NOT_FINITE, "1", None, 10**400)
+    ]
+    + [({"actions": value}, "actions") for value in (*NO_COUNTS, 100_001, 2**63)],
 )
 def test_value_iteration_refuses_values_out_of_range(changes: dict[str, Any], names: str) -> None:
     with pytest.raises(ConfigurationError, match=f"{names} = "):

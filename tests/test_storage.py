@@ -1210,7 +1210,7 @@ except kreps.StorageError:
 def test_resuming_in_another_environment_is_refused(checkpoint: Good, tmp_path: Path) -> None:
     path = tmp_path / "checkpoint"
     path.write_bytes(checkpoint.content)
-    with pytest.raises(kreps.ConfigurationError, match="resume in the environment"):
+    with pytest.raises(kreps.ConfigurationError, match="give the environment of the checkpoint"):
         LEARNERS[checkpoint.method].resume(path, gym.make("Pendulum-v1"))
 
 

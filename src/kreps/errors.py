@@ -5,25 +5,41 @@ Messages name the value found, the limit that it violates, and the remedy.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 
-def printable(text: str) -> str:
-    """The text with escapes (``\\x1b``) in place of all that a terminal might act on or not show.
+from kreps.terminal import printable
 
-    These are control characters, line breaks among them, and halves of surrogate pairs, as text of
-    files, environments and file names may hold them.
-    """
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+def shown(value: object) -> str:
+    """A value for a message, cut off where it is long."""
+    try:
+        return f"{value!r:.60}"
+    except Exception:  # such as a whole number of more digits than Python writes
+        return f"a {type(value).__name__}"
 
 
 class KrepsError(Exception):
     """Base class of all errors that kreps raises; as text it is one line that can be printed."""
 
     def __str__(self) -> str:
-        return printable(super().__str__())
+        return printable(super().__str__()).replace("\n", r"\n").replace("\t", r"\t")
 
 
 class ConfigurationError(KrepsError, ValueError):
     """An invalid parameter or combination of parameters."""
+
+
+@contextmanager
+def enough_memory(what: str) -> Iterator[None]:
+    """An error of the library where the memory is not enough for something."""
+    try:
+        yield
+    except MemoryError as error:
+        raise ConfigurationError(
+            f"{what} needs more memory than there is ({error}); lower the settings of which it "
+            "makes many, such as window, rollouts per iteration or samples of the model"
+        ) from error
 
 
 class SpaceError(ConfigurationError):

@@ -8,13 +8,20 @@ from math import inf
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, get_args
 
-from kreps.errors import ConfigurationError
+from kreps.errors import ConfigurationError, shown
 
 TransitionModelName = Literal["dynamics", "change", "embedding", "sample"]
 RolloutLengths = Literal["independent", "stratified"]
 PolicyFitName = Literal["map", "bounded"]
 AngleWrap = Literal["discontinuous", "continuous"]
 Noise = Literal["bang-bang", "gaussian", "pink"]
+
+
+MOST = 100_000
+"""Largest number of rollouts, grid points per coordinate or candidate actions: all are made."""
+
+LARGEST = 10**15
+"""Largest whole number elsewhere, where it only limits others."""
 
 
 class Checked:
@@ -26,7 +33,7 @@ class Checked:
     def _choose(self, name: str, kind: Any) -> None:
         if getattr(self, name) not in get_args(kind):
             raise ConfigurationError(
-                f"{name} = {getattr(self, name)!r} is unknown; choose one of "
+                f"{name} = {shown(getattr(self, name))} is unknown; choose one of "
                 + ", ".join(repr(choice) for choice in get_args(kind))
             )
 
@@ -34,24 +41,30 @@ class Checked:
         for name in names:
             self._check(name, Real, "positive and finite", lambda v: 0 < v < inf)
 
-    def _whole(self, *names: str) -> None:
+    def _whole(self, *names: str, most: int = LARGEST) -> None:
         for name in names:
-            self._check(name, Integral, "a whole number >= 1", lambda v: v >= 1)
+            limit = f"a whole number from 1 to {most}"
+            self._check(name, Integral, limit, lambda v: 1 <= v <= most)
 
     def _check(self, name: str, kind: type, limit: str, holds: Callable[[Any], bool]) -> None:
         """Accept numbers of any type, NumPy's included, and store them as Python's."""
         value = getattr(self, name)
         is_number = isinstance(value, kind) and not isinstance(value, bool)
+        if is_number and kind is Real:
+            try:
+                value = float(value)
+            except OverflowError:  # a whole number that is too large for a float
+                value = inf
         if not (is_number and holds(value)):
-            raise ConfigurationError(f"{name} = {value!r}, but it must be {limit}")
-        object.__setattr__(self, name, int(value) if kind is Integral else float(value))
+            raise ConfigurationError(f"{name} = {shown(value)}, but it must be {limit}")
+        object.__setattr__(self, name, int(value) if kind is Integral else value)
 
     def _section(self, name: str, *kinds: type) -> None:
         value = getattr(self, name)
         if not isinstance(value, kinds):
             names = ["None" if k is type(None) else f"kreps.{k.__name__}(...)" for k in kinds]
             raise ConfigurationError(
-                f"{name} = {value!r}, but it must be {' or '.join(names)}; "
+                f"{name} = {shown(value)}, but it must be {' or '.join(names)}; "
                 f'to change one field, write {{"{name}.field": value}}'
             )
 
@@ -85,7 +98,7 @@ class RKHS(Checked):
     Attributes:
         max_rank: largest number of features of V.
         tolerance: largest squared residual of the kernel function of a sampled state that needs no
-            further feature.  Squared norms of these functions are 1.
+            further feature, in (0, 1).  Squared norms of these functions are 1.
         angle_wrap: whether V and the reward model may be ``"discontinuous"`` where an angle wraps
             around, as a reward that is a function of the angle in rad is; or are
             ``"continuous"``, that is periodic, as the dynamics and the policy always are.
@@ -97,7 +110,7 @@ class RKHS(Checked):
 
     def __post_init__(self) -> None:
         self._whole("max_rank")
-        self._positive("tolerance")
+        self._check("tolerance", Real, "above 0 and below 1", lambda v: 0 < v < 1)
         self._choose("angle_wrap", AngleWrap)
 
 
@@ -112,7 +125,7 @@ class Grid(Checked):
     size: int = 10
 
     def __post_init__(self) -> None:
-        self._whole("size")
+        self._whole("size", most=MOST)
 
 
 @dataclass(frozen=True)
@@ -137,7 +150,9 @@ class LowRank(Checked):
 
     def __post_init__(self) -> None:
         self._whole("rank", "subsample")
-        self._check("above", Integral, "a whole number >= 0", lambda v: v >= 0)
+        self._check(
+            "above", Integral, f"a whole number from 0 to {LARGEST}", lambda v: 0 <= v <= LARGEST
+        )
 
 
 @dataclass(frozen=True)
@@ -171,11 +186,13 @@ class ModelBased(Checked):
     max_samples: int = 20_000
 
     def __post_init__(self) -> None:
-        self._whole("actions_per_state", "max_samples")
-        self._check("proposal_std_scale", Real, "finite and >= 1", lambda v: 1 <= v < inf)
+        self._whole("actions_per_state", "max_samples", most=10_000_000)
+        self._check("proposal_std_scale", Real, "from 1 to 1000", lambda v: 1 <= v <= 1000)
         self._check("model_rollout_fraction", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
-        none_or_some = "0, or a whole number >= 2"
-        self._check("acceptance_rollouts", Integral, none_or_some, lambda v: v == 0 or v >= 2)
+        none_or_some = f"0, or a whole number from 2 to {MOST}"
+        self._check(
+            "acceptance_rollouts", Integral, none_or_some, lambda v: v == 0 or 2 <= v <= MOST
+        )
         self._check("exploration_bonus", Real, "finite and >= 0", lambda v: 0 <= v < inf)
 
 
@@ -187,7 +204,7 @@ class LearnerSettings(Checked):
     """The settings that all learners have.
 
     Attributes:
-        restart_probability: p, with which the process restarts at each step.
+        restart_probability: p, with which the process restarts at each step, in [1e-9, 1).
         window: largest number of rollouts in the replay window, a third of them reserved for those
             with a state-dependent reward.  None keeps all.
     """
@@ -196,10 +213,12 @@ class LearnerSettings(Checked):
     window: int | None = 30
 
     def __post_init__(self) -> None:
-        self._check("restart_probability", Real, "in (0, 1)", lambda v: 0 < v < 1)
+        self._check(
+            "restart_probability", Real, "at least 1e-9 and below 1", lambda v: 1e-9 <= v < 1
+        )
         if self.window is not None:
-            whole = "a whole number >= 1, or None to keep all"
-            self._check("window", Integral, whole, lambda v: v >= 1)
+            whole = f"a whole number from 1 to {LARGEST}, or None to keep all"
+            self._check("window", Integral, whole, lambda v: 1 <= v <= LARGEST)
 
 
 @dataclass(frozen=True)
@@ -229,7 +248,7 @@ class OnPolicySettings(LearnerSettings):
         super().__post_init__()
         self._section("exploration", Exploration)
         self._choose("rollout_lengths", RolloutLengths)
-        self._whole("initial_rollouts", "rollouts_per_iteration")
+        self._whole("initial_rollouts", "rollouts_per_iteration", most=MOST)
 
 
 @dataclass(frozen=True)
@@ -314,7 +333,7 @@ class ValueIterationSettings(OnPolicySettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._positive("temperature")
-        self._whole("actions")
+        self._whole("actions", most=MOST)
 
 
 @dataclass(frozen=True)
@@ -343,7 +362,7 @@ class GridValueIterationSettings(LearnerSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._whole("actions", "grid_states", "grid_actions")
+        self._whole("actions", "grid_states", "grid_actions", most=MOST)
         if self.ranges is not None:
             try:
                 ranges = tuple((float(low), float(high)) for low, high in self.ranges)
@@ -351,7 +370,7 @@ class GridValueIterationSettings(LearnerSettings):
                 ranges = ((1.0, 0.0),)
             if not all(-float("inf") < low < high < float("inf") for low, high in ranges):
                 raise ConfigurationError(
-                    f"ranges = {self.ranges!r}, but it must be a pair (smallest, largest) of "
+                    f"ranges = {shown(self.ranges)}, but it must be a pair (smallest, largest) of "
                     "finite numbers for each observation coordinate"
                 )
             object.__setattr__(self, "ranges", ranges)

@@ -21,7 +21,7 @@ from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
-from kreps.errors import ConfigurationError, DataError
+from kreps.errors import ConfigurationError, DataError, enough_memory, shown
 from kreps.kernels.threads import blas_threads
 from kreps.learning import storage
 from kreps.learning.collect import collect
@@ -36,8 +36,10 @@ from kreps.settings import LearnerSettings, OnPolicySettings
 
 
 def _whole_number(name: str, value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 0:
-        raise ConfigurationError(f"{name} = {value!r}, but it must be a whole number >= 0")
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= int(value) < 2**128:
+        raise ConfigurationError(
+            f"{name} = {shown(value)}, but it must be a whole number >= 0 of at most 128 bits"
+        )
     return int(value)
 
 
@@ -246,7 +248,7 @@ class Learner(Generic[MethodSettings]):
         assert self.env is not None
         for _ in range(iterations):
             started = time.process_time()
-            with blas_threads(self.threads, exact=True):
+            with blas_threads(self.threads, exact=True), enough_memory("collecting rollouts"):
                 rollouts = self._collect(self.env, on_rollout)
             seconds = time.process_time() - started
             info = self.update(rollouts)
@@ -285,7 +287,7 @@ class Learner(Generic[MethodSettings]):
 
     def _update(self, samples: Any) -> UpdateReport:
         rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
-        with blas_threads(self.threads, exact=True):
+        with blas_threads(self.threads, exact=True), enough_memory("the update"):
             state, info = self._updated(samples, rng)
         storage.require_storable(state)
         self.state = state

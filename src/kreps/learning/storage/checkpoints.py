@@ -148,7 +148,7 @@ def load_checkpoint(
         if not isinstance(header["settings"], dict):
             raise StorageError(f"its settings are {header['settings']!r:.40}, not named values")
         settings = changed(settings_type(), header["settings"])
-        Whole().check(header["seed"], "seed", {}, {})
+        Whole(bits=128).check(header["seed"], "seed", {}, {})
         stored = header["state"]
         _check_presence(stored, method)
         given = {"task": task, "capacity": settings.window}

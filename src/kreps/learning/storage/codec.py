@@ -169,14 +169,23 @@ class Number:
 
 @dataclass(frozen=True)
 class Whole:
-    """A whole number >= 0 in the header."""
+    """A whole number >= 0 in the header.
+
+    Attributes:
+        bits: that it has at most.
+    """
+
+    bits: int = 63
 
     def encode(self, value: Any, name: str, tensors: Tensors) -> Any:
         return int(value)
 
     def check(self, header: Any, name: str, layout: Layout, sizes: Sizes) -> None:
-        if type(header) is not int or header < 0:
-            raise StorageError(f"{name} = {header!r:.40}, but it must be a whole number >= 0")
+        if type(header) is not int or not 0 <= header < 2**self.bits:
+            raise StorageError(
+                f"{name} = {header!r:.40}, but it must be a whole number >= 0 of at most "
+                f"{self.bits} bits"
+            )
 
     def decode(self, header: Any, name: str, load: Load, given: Mapping[str, Any]) -> int:
         return int(header)
