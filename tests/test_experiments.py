@@ -206,7 +206,7 @@ def test_the_candidates_have_the_settings_of_the_committed_search() -> None:
 
 
 def rows_with(
-    curve: str, values: Sequence[float], task: str = "reaching", iterations: int = 10
+    curve: str, values: Sequence[float], task: str = "reaching", iterations: int = 15
 ) -> list[dict[str, str]]:
     return [
         {
@@ -247,22 +247,58 @@ def test_the_verdict_follows_from_the_interval_of_the_difference() -> None:
 
 
 def test_a_claim_about_a_single_curve() -> None:
-    gains = assess(claim_of("A", None, measure=claims.later_gain), rows_with("A", [1.0, 2.0, 5.0]))
+    rows = rows_with("A", [1.0, 2.0, 5.0, 3.0, 7.0, 4.0])
+    gains = assess(claim_of("A", None, measure=claims.later_gain), rows)
     assert gains is not None
-    assert gains["effect"] == pytest.approx(0.001 * (8.0 - 7.0), abs=1e-4)
+    assert gains["effect"] == pytest.approx(0.001 * (13.0 - 7.0), abs=1e-4)
     assert gains["comparison"] == "A"
 
 
 def test_curves_are_compared_over_their_common_iterations() -> None:
-    long = rows_with("A", [0.0, 0.0], iterations=20)
-    short = rows_with("B", [0.0, 0.0], iterations=15)
+    long = rows_with("A", [0.0] * 6, iterations=20)
+    short = rows_with("B", [0.0] * 6, iterations=15)
     found = assess(claim_of("A", "B"), [*long, *short])
     assert found is not None
     assert found["iterations"] == 15
     assert found["effect"] == 0.0
-    once = assess(claim_of("A", "B"), [*long, *rows_with("B", [0.0, 0.0], iterations=1)])
+    once = assess(claim_of("A", "B"), [*long, *rows_with("B", [0.0] * 6, iterations=1)])
     assert once is not None
     assert once["iterations"] == 20  # one iteration is all that the other needs
+
+
+@pytest.mark.parametrize(
+    ("seeds", "iterations", "reason"),
+    [
+        (1, 20, "too few seeds: 1, at least 6"),
+        (2, 3, "too few seeds: 2, at least 6"),
+        (5, 20, "too few seeds: 5, at least 6"),
+        (6, 1, "too few iterations: 1, at least 14"),
+        (6, 3, "too few iterations: 3, at least 14"),
+        (6, 13, "too few iterations: 13, at least 14"),
+    ],
+)
+@pytest.mark.parametrize("worse", ["B", None])
+@pytest.mark.filterwarnings("error")
+def test_too_few_seeds_or_iterations_get_no_verdict(
+    seeds: int, iterations: int, reason: str, worse: str | None
+) -> None:
+    rows = rows_with("A", [1.0] * seeds, iterations=iterations)
+    rows += rows_with("B", [0.0] * 10, iterations=iterations)
+    for measure in (claims.early, claims.late, claims.later_gain, claims.steadiness):
+        found = assess(claim_of("A", worse, measure=measure), rows)
+        assert found is not None
+        assert found["verdict"] == reason
+        assert found["effect"] is found["low"] is found["high"] is None
+        row = claims.claims_table([found]).splitlines()[2]
+        assert f"| – | – | better | **{reason}** |" in row and "nan" not in row
+
+
+@pytest.mark.filterwarnings("error")
+def test_seeds_that_are_all_equal_have_an_interval_without_a_warning() -> None:
+    found = assess(claim_of("A", "B"), [*rows_with("A", [1.0] * 6), *rows_with("B", [0.0] * 6)])
+    assert found is not None
+    assert found["effect"] == found["low"] == found["high"] == 1.0
+    assert found["verdict"] == "confirmed"
 
 
 @pytest.mark.parametrize(
@@ -304,7 +340,8 @@ def test_claims_name_curves_that_their_figures_show() -> None:
 
 def test_claims_are_written_from_result_files(tmp_path: Path) -> None:
     assert write_claims(tmp_path) == []
-    rows = [*rows_with("kernel REPS", [-0.2, -0.3]), *rows_with("NPALP", [-0.5, -0.4])]
+    better, worse = [-0.2, -0.3, -0.25, -0.2, -0.3, -0.25], [-0.5, -0.4, -0.5, -0.4, -0.5, -0.4]
+    rows = [*rows_with("kernel REPS", better), *rows_with("NPALP", worse)]
     with open(tmp_path / "figure-1a.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()

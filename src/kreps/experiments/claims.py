@@ -9,6 +9,8 @@ separated* otherwise.  The limit is zero for "better".  For "as good as" it is m
 twentieth of the difference between the first policy and the best known one.  A claim that two
 curves end equal, or that one no longer changes, is confirmed if the interval lies within the margin
 around zero, and contradicted if it lies outside.
+
+With fewer than `MIN_SEEDS` seeds or `MIN_ITERATIONS` iterations there is no interval, no verdict.
 """
 
 from __future__ import annotations
@@ -42,6 +44,16 @@ EARLY = 4
 
 LATE = 5
 """Number of iterations at the end over which `late` averages."""
+
+MIN_SEEDS = 6
+"""Seeds of each curve that a verdict needs.
+
+If six seeds all have the same sign, a two-sided sign test gives 2 / 2^6 = 3 %; five give at least
+6 %.
+"""
+
+MIN_ITERATIONS = EARLY + 2 * LATE
+"""Iterations that a verdict needs: first, following and last ones then do not overlap."""
 
 MARGINS = {"figure-1a": 0.04, "figure-1b": 4.0, "figure-2b": 4.0}
 """Margins in reward per step: a twentieth of best known minus first policy, rounded."""
@@ -222,16 +234,52 @@ def assess(claim: Claim, rows: Rows) -> dict[str, Any] | None:
         rows: of its figure, as ``csv.DictReader`` reads them.
 
     Returns:
-        A row of ``claims.json``; None if the rows hold fewer than two seeds of a curve.
+        A row of ``claims.json``.  Without a verdict, which has the reason in its place, its numbers
+        are None.  The row itself is None if the rows hold no seed of a curve.
     """
-    from scipy.stats import bootstrap  # slow to import, and only needed here
-
     rows = named_rows(rows)
     curves = [claim.better] if claim.worse is None else [claim.better, claim.worse]
     iterations = common_iterations(rows, curves)
-    samples = [by_seed(rows, curve, claim.measure, iterations) for curve in curves]
-    if min(len(sample) for sample in samples) < 2:
+    seeds = [len({row["seed"] for row in rows if row["method"] == curve}) for curve in curves]
+    if not all(seeds):
         return None
+    numbers: dict[str, float | None] = {"effect": None, "low": None, "high": None}
+    judgement = too_few(seeds, iterations)
+    if not judgement:
+        samples = [by_seed(rows, curve, claim.measure, iterations) for curve in curves]
+        effect, low, high = interval(samples)
+        numbers = {"effect": round(effect, 4), "low": round(low, 4), "high": round(high, 4)}
+        judgement = verdict(low, high, claim.kind, MARGINS[claim.figure])
+    return {
+        "claim": claim.text,
+        "figure": claim.figure,
+        "comparison": claim.better if claim.worse is None else f"{claim.better} - {claim.worse}",
+        "measure": claim.measure.__name__.replace("_", " "),
+        "iterations": iterations,
+        "kind": claim.kind.value,
+        "margin": 0.0 if claim.kind is Kind.BETTER else MARGINS[claim.figure],
+        **numbers,
+        "seeds": seeds,
+        "verdict": judgement,
+    }
+
+
+def too_few(seeds: Sequence[int], iterations: int) -> str:
+    """Why there is no verdict: too few seeds of a curve, or iterations; empty if there is one."""
+    if min(seeds) < MIN_SEEDS:
+        return f"too few seeds: {min(seeds)}, at least {MIN_SEEDS}"
+    if iterations < MIN_ITERATIONS:
+        return f"too few iterations: {iterations}, at least {MIN_ITERATIONS}"
+    return ""
+
+
+def interval(samples: Sequence[FloatArray]) -> tuple[float, float, float]:
+    """Mean, or difference of two means, and the ends of its 95 % interval.
+
+    Args:
+        samples: one or two arrays (seeds,).
+    """
+    from scipy.stats import bootstrap  # slow to import, and only needed here
 
     def effect(*resampled: FloatArray, axis: int = -1) -> FloatArray:
         means = [each.mean(axis=axis) for each in resampled]
@@ -245,21 +293,7 @@ def assess(claim: Claim, rows: Rows) -> dict[str, Any] | None:
         vectorized=True,
         random_state=generator(0, Purpose.BOOTSTRAP),
     ).confidence_interval
-    low, high = float(found.low), float(found.high)
-    return {
-        "claim": claim.text,
-        "figure": claim.figure,
-        "comparison": claim.better if claim.worse is None else f"{claim.better} - {claim.worse}",
-        "measure": claim.measure.__name__.replace("_", " "),
-        "iterations": iterations,
-        "kind": claim.kind.value,
-        "margin": 0.0 if claim.kind is Kind.BETTER else MARGINS[claim.figure],
-        "effect": round(float(effect(*samples)), 4),
-        "low": round(low, 4),
-        "high": round(high, 4),
-        "seeds": [len(sample) for sample in samples],
-        "verdict": verdict(low, high, claim.kind, MARGINS[claim.figure]),
-    }
+    return float(effect(*samples)), float(found.low), float(found.high)
 
 
 def write_claims(folder: Path) -> list[Path]:
@@ -295,15 +329,18 @@ def claims_table(assessed: Sequence[Mapping[str, Any]]) -> str:
     """The documentation's table of all claims."""
     rows = []
     for each in assessed:
-        places = 1 if max(abs(each["low"]), abs(each["high"])) >= 1 else 3
-        effect, low, high = (f"{each[name]:+.{places}f}" for name in ("effect", "low", "high"))
+        effect, range_ = "–", "–"
+        if each["effect"] is not None:
+            places = 1 if max(abs(each["low"]), abs(each["high"])) >= 1 else 3
+            effect, low, high = (f"{each[name]:+.{places}f}" for name in ("effect", "low", "high"))
+            range_ = f"{low} to {high}"
         kind = each["kind"] + (f" (margin {each['margin']:g})" if each["margin"] else "")
         rows.append(
             [
                 each["claim"],
                 f"{each['measure']}: {each['comparison']}",
                 effect,
-                f"{low} to {high}",
+                range_,
                 kind,
                 f"**{each['verdict']}**",
             ]

@@ -116,7 +116,8 @@ def table_rows(summary: Mapping[str, Mapping[str, Any]]) -> list[list[str]]:
         row = [method]
         for name in ("stochastic", "greedy"):
             mean, error = entry[name]["mean"], entry[name]["two_standard_errors"]
-            row.append(f"{mean:.{places}f} ± {error:.{places}f}")
+            spread = f" ± {error:.{places}f}" if entry["trials"] > 1 else ""
+            row.append(f"{mean:.{places}f}{spread}")
             row.append(f"{entry[name]['worst']:.{places}f}")
         rows.append(row)
     return rows

@@ -7,6 +7,7 @@ from concurrent.futures import Executor, as_completed
 from pathlib import Path
 from typing import Any
 
+from rich import get_console
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -14,6 +15,7 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.table import Column
 
 from kreps.errors import TrialFailure
 from kreps.experiments.provenance import commit
@@ -102,12 +104,15 @@ def run_trials(trials: Sequence[Trial], executor: Executor, folder: Path) -> lis
     Raises:
         TrialFailure: at least one trial failed; the error of the first one is its cause.
     """
+    whole = Column(no_wrap=True)  # in a narrow terminal only the trial's name is cut
     bar = Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(elapsed_when_finished=True),
-        TextColumn("{task.fields[last]}"),
+        TextColumn("{task.description}", table_column=whole),
+        BarColumn(bar_width=20),
+        MofNCompleteColumn(table_column=whole),
+        TimeRemainingColumn(elapsed_when_finished=True, table_column=whole),
+        TextColumn("{task.fields[last]}", table_column=Column(no_wrap=True, ratio=1)),
+        disable=not get_console().is_terminal,
+        expand=True,
     )
     with bar:
         kept = _ResultFolder(trials, folder, bar)
