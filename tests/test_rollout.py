@@ -575,9 +575,9 @@ def rewarded(*rewards: float, terminated: bool = False) -> Rollout:
 
 
 def test_a_terminated_rollout_counts_by_its_weight() -> None:
-    # one step of reward 1, then a restart; a hundred steps of reward 0
+    # one step of reward 1, then none until the restart; a hundred steps of reward 0
     found = discounted_average([rewarded(1.0, terminated=True), rewarded(*[0.0] * 100)], 0.02)
-    assert found.mean == pytest.approx(1.0 / (1.0 + (1.0 - 0.98**100) / 0.02))
+    assert found.mean == pytest.approx(1.0 / (1.0 / 0.02 + (1.0 - 0.98**100) / 0.02))
     assert (found.episodes, found.steps) == (2, 100)
 
 

@@ -89,13 +89,16 @@ def evaluation_rollouts(
 def discounted_average(rollouts: Sequence[Rollout], restart_probability: float) -> Evaluation:
     """The sum of all rewards weighted by ``gamma^t``, divided by the sum of all weights.
 
-    A rollout whose task ends is followed by a restart and has no further weights, so that short
-    rollouts count less (renewal reward).  The mean is the ratio of two sums over rollouts; its
-    standard error is that of the delta method.
+    This is the average reward per step of the restarting process.  After a termination there is no
+    reward until the restart: these steps have the weights ``gamma^T + gamma^(T+1) + ...``, which
+    sum to ``gamma^T / (1 - gamma)``.  The mean is the ratio of two sums over rollouts; its standard
+    error is that of the delta method.
     """
     count = len(rollouts)
     weights = [(1.0 - restart_probability) ** np.arange(len(rollout)) for rollout in rollouts]
-    lengths = np.array([w.sum() for w in weights])
+    after_end = [(1.0 - restart_probability) ** len(r) / restart_probability for r in rollouts]
+    ended = np.array([rollout.terminated for rollout in rollouts])
+    lengths = np.array([w.sum() for w in weights]) + np.where(ended, after_end, 0.0)
     gains = np.array([w @ rollout.rewards for w, rollout in zip(weights, rollouts, strict=True)])
     mean = float(gains.sum() / lengths.sum())
     scatter = (gains - mean * lengths) / lengths.mean()
