@@ -68,7 +68,7 @@ def random_policy(fraction: float = 0.3, scale: float = 0.2, count: int = 40) ->
 def linear_program(
     distances: FloatArray,
     state: IntArray,
-    successor: IntArray,
+    successor: list[int | None],
     rewards: FloatArray,
     gamma: float,
     slope: float,
@@ -78,8 +78,9 @@ def linear_program(
     left, right = [], []
     for s, after, reward in zip(state, successor, rewards, strict=True):
         row = np.zeros(count)
-        row[after] += gamma
         row[s] -= 1.0
+        if after is not None:  # V after a termination is that of reward zero
+            row[after] += gamma
         left.append(row)
         right.append(-reward)
     for a in range(count):
@@ -103,10 +104,13 @@ def test_the_bounds_solve_the_linear_program(seed: int, slope: float) -> None:
     data = Transitions.from_rollouts(rollouts_of(seed))
     distances = cdist(data.points, data.points)
     q, _, _ = sample_bounds(
-        data.rewards, 0.9, slope * distances[np.ix_(data.successor, data.state)]
+        data.rewards,
+        np.full(len(data), 0.9),
+        slope * distances[np.ix_(data.successor, data.state)],
     )
     values = (q - slope * distances[:, data.state]).max(axis=1)
-    wanted = linear_program(distances, data.state, data.successor, data.rewards, 0.9, slope)
+    successor: list[int | None] = data.successor.tolist()
+    wanted = linear_program(distances, data.state, successor, data.rewards, 0.9, slope)
     np.testing.assert_allclose(values, wanted, rtol=0, atol=1e-6)
 
 
@@ -115,8 +119,8 @@ def test_an_update_solves_the_linear_program_of_its_window(seed: int) -> None:
     rollouts = rollouts_of(seed, 2) + rollouts_of(seed + 100, 2, terminated=True)
     policy = learn_policy(rollouts, restart_probability=0.1, lipschitz=1.5)
     data = Transitions.from_rollouts(rollouts)
-    successor = data.successor.copy()
-    successor[[11, 15]] = 10, 15  # terminations lead to their own start states
+    successor: list[int | None] = data.successor.tolist()
+    successor[11] = successor[15] = None
     points = policy.kernel.embed(data.points)
     wanted = linear_program(
         cdist(points, points),
@@ -135,7 +139,7 @@ def test_an_update_solves_the_linear_program_of_its_window(seed: int) -> None:
 def test_the_bounds_are_the_limit_of_fixed_point_iteration(gamma: float, slope: float) -> None:
     data = Transitions.from_rollouts(rollouts_of(7, 8, 10))
     costs = slope * cdist(data.points[data.successor], data.states)
-    q, improvements, residual = sample_bounds(data.rewards, gamma, costs)
+    q, improvements, residual = sample_bounds(data.rewards, np.full(len(data), gamma), costs)
     wanted = np.zeros(len(q))
     for _ in range(2500):
         wanted = data.rewards + gamma * (wanted - costs).max(axis=1)
@@ -144,16 +148,12 @@ def test_the_bounds_are_the_limit_of_fixed_point_iteration(gamma: float, slope: 
     assert 1 <= improvements < 50
 
 
-def test_a_termination_leads_to_the_start_state_of_its_own_rollout() -> None:
+def test_after_a_termination_nothing_more_is_earned() -> None:
     """With a slope so steep that no sample bounds V at another state."""
     gamma = 0.9
     long = Rollout([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]], np.zeros((2, 2)), [1.0, 2.0], True)
     short = Rollout([[0.0, 9.0], [1.0, 9.0]], np.zeros((1, 2)), [-1.0], True)
-    first = (1.0 + gamma * 2.0) / (1.0 - gamma**2)
-    wanted = {
-        "long": [first, 2.0 + gamma * first],
-        "short": [-1.0 / (1.0 - gamma)],
-    }
+    wanted = {"long": [1.0 + gamma * 2.0, 2.0], "short": [-1.0]}
     for order in (("long", "short"), ("short", "long")):
         rollouts = [{"long": long, "short": short}[name] for name in order]
         policy = learn_policy(rollouts, lipschitz=1e6, restart_probability=0.1)
@@ -188,7 +188,8 @@ def test_a_residual_above_rounding_is_shown_as_not_converged(residual: float, no
 def test_too_few_improvements_leave_a_residual() -> None:
     data = Transitions.from_rollouts(rollouts_of(7, 8, 10))
     costs = 0.5 * cdist(data.points[data.successor], data.states)
-    _, improvements, residual = sample_bounds(data.rewards, 0.98, costs, max_improvements=2)
+    gamma = np.full(len(data), 0.98)
+    _, improvements, residual = sample_bounds(data.rewards, gamma, costs, max_improvements=2)
     assert improvements == 2
     assert residual > 1e-3
 

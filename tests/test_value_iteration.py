@@ -92,29 +92,37 @@ def brute_force(
     gamma: float,
     sweeps: int,
     first: float = 0.0,
+    end: float = 0.0,
+    unit: float = 1.0,
 ) -> tuple[list[FloatArray], FloatArray]:
     """V at all points after each sweep, and the targets whose Q is the outcome.
 
-    These are of the last sweep, plus the limit of the level that further sweeps would add.
+    These are of the last sweep.  After a termination no reward follows: V is ``end``, or that of
+    zero in each step.  Where the shape of V has converged and its level has not, the limit of the
+    level is added at once.
     """
     points = np.concatenate([r.observations for r in rollouts])
     rewards = np.concatenate([r.rewards for r in rollouts])
-    min_return, max_return = rewards.min() / (1.0 - gamma), rewards.max() / (1.0 - gamma)
-    history = [np.full(len(points), first)]
+    earned = np.append(rewards, end * (1.0 - gamma))
+    min_return, max_return = earned.min() / (1.0 - gamma), earned.max() / (1.0 - gamma)
+    history, moved = [np.full(len(points), first)], 0.0
     targets = rewards
     for _ in range(sweeps):
-        at = iter(np.split(history[-1], np.cumsum([len(r) + 1 for r in rollouts])[:-1]))
+        before = np.clip(history[-1] + moved, min_return, max_return)
+        at = iter(np.split(before, np.cumsum([len(r) + 1 for r in rollouts])[:-1]))
         values = [next(at) for _ in rollouts]
-        at_start = np.mean([v[0] for v in values])
         after = [
-            np.append(v[1:-1], at_start if r.terminated else v[-1])
+            np.append(v[1:-1], end if r.terminated else v[-1])
             for v, r in zip(values, rollouts, strict=True)
         ]
         targets = rewards + gamma * np.concatenate(after)
         q = q_by_hand(model, points, candidates, targets)
         history.append(np.clip(soft_by_hand(q, temperature), min_return, max_return))
-    level = float((history[-1] - history[-2]).mean()) * gamma / (1.0 - gamma)
-    return history, targets + level
+        difference = history[-1] - before
+        moved = 0.0
+        if np.ptp(difference) <= 1e-3 * unit:
+            moved = float(difference.mean()) * gamma / (1.0 - gamma)
+    return history, targets
 
 
 # ---- the fixed point --------------------------------------------------------------------------
@@ -131,8 +139,12 @@ def test_values_are_those_of_brute_force(temperature: float) -> None:
     ]
     model = embedding_of(data, [0.6, 0.8, 0.5], 0.05)
     candidates = candidate_actions(TASK, 4)
-    q = iterate_values(model, data, rewards, candidates, temperature, gamma)
-    history, targets = brute_force(model, standard, candidates, temperature, gamma, q.sweeps)
+    zero = -float(data.rewards.max()) / unit
+    q = iterate_values(model, data, rewards, zero, candidates, temperature, gamma)
+    end = zero / (1.0 - gamma)
+    history, targets = brute_force(
+        model, standard, candidates, temperature, gamma, q.sweeps, end=end
+    )
 
     changes = [np.ptp(b - a) for a, b in itertools.pairwise(history)]
     assert q.change == pytest.approx(changes[-1], rel=1e-6, abs=1e-12)
@@ -163,7 +175,10 @@ def test_the_policy_of_an_update_has_the_q_of_brute_force_in_units_of_the_reward
     candidates = np.linspace(-1.0, 1.0, 5)[:, None]
     scaled = temperature * float(data.rewards.std())
     first = data.rewards.max() / 0.3
-    history, targets = brute_force(model, rollouts, candidates, scaled, 0.7, info.sweeps, first)
+    unit = float(data.rewards.std())
+    history, targets = brute_force(
+        model, rollouts, candidates, scaled, 0.7, info.sweeps, first, unit=unit
+    )
     assert info.converged and info.samples == len(data)
     assert info.change == pytest.approx(np.ptp(history[-1] - history[-2]) / data.rewards.std())
 
@@ -197,20 +212,19 @@ def test_a_chain_has_the_values_of_exact_dynamic_programming(temperature: float)
     model = KernelEmbedding.fit(kernel, inputs, 1e-10)
     candidates = candidate_actions(task, 3)
     np.testing.assert_array_equal(candidates[:, 0], moves)
-    found = iterate_values(model, data, data.rewards, candidates, temperature, gamma)
+    found = iterate_values(model, data, data.rewards, -0.3, candidates, temperature, gamma)
 
     exact = np.zeros((length, 3))
     for _ in range(500):
         v = soft_by_hand(exact, temperature)
         for position, j in itertools.product(range(length), range(3)):
             after = v[int(min(max(position + moves[j], 0.0), length - 1.0))]
-            after = v.mean() if (position, j) == (3, 2) else after
+            after = -0.3 / (1.0 - gamma) if (position, j) == (3, 2) else after
             exact[position, j] = gain[position, j] + gamma * after
     positions = np.arange(length, dtype=np.float64)[:, None]
     gram = Kernel(task.state_factors, np.array([0.05])).gram(data.states, positions)
     q = found.offset + gram.T @ found.table
-    error = q - exact  # iteration stops when V changes only by a constant
-    assert np.ptp(error) <= 2e-3 * gamma / (1.0 - gamma)
+    np.testing.assert_allclose(q, exact, atol=2e-3 * gamma / (1.0 - gamma))
     assert np.ptp(exact) > 1.0
     np.testing.assert_array_equal(q.argmax(axis=1), exact.argmax(axis=1))
 
@@ -222,7 +236,8 @@ def test_strengths_that_sum_to_more_than_one_do_not_diverge() -> None:
     rewards, _ = standardise(data.rewards)
     model = embedding_of(data, [2.0, 2.0, 2.0], 1e-3)
     candidates = candidate_actions(TASK, 9)
-    found = iterate_values(model, data, rewards, candidates, 0.0, gamma)
+    zero = float(rewards.mean())
+    found = iterate_values(model, data, rewards, zero, candidates, 0.0, gamma)
     min_return, max_return = rewards.min() / (1.0 - gamma), rewards.max() / (1.0 - gamma)
 
     assert candidates[4, 0] == 0.0
@@ -244,7 +259,7 @@ def test_strengths_that_sum_to_more_than_one_do_not_diverge() -> None:
     beta = model.strengths(inputs)
     for _ in range(100):
         after = values[data.successor]
-        after[data.terminated] = values[data.start].mean()
+        after[data.terminated] = zero / (1.0 - gamma)
         free = rewards + gamma * after
         q = free.mean() + beta.T @ (free - free.mean())
         values = q.reshape(len(candidates), -1).max(axis=0)

@@ -97,13 +97,13 @@ def update(
     distances = cdist(points, points[data.state])
     clock.lap("distances")
     rewards, unit = standardise(data.rewards)
-    # after a termination the process restarts; here in the start state of the same rollout
-    own_start = data.start[data.rollout]
-    successor = np.where(data.terminated, own_start, data.successor)
+    gamma = 1.0 - settings.restart_probability
+    # V after a termination: reward zero, standardised, in each step
+    after_end = -float(data.rewards.max()) / unit / (1.0 - gamma)
     bounds, improvements, residual = sample_bounds(
-        rewards,
-        1.0 - settings.restart_probability,
-        settings.lipschitz * distances[successor],
+        rewards + np.where(data.terminated, gamma * after_end, 0.0),
+        np.where(data.terminated, 0.0, gamma),
+        settings.lipschitz * distances[data.successor],
     )
     clock.lap("fixed point")
     policy = LipschitzPolicy(
@@ -121,13 +121,16 @@ def update(
 
 
 def sample_bounds(
-    rewards: FloatArray, gamma: float, costs: FloatArray, max_improvements: int = MAX_IMPROVEMENTS
+    rewards: FloatArray,
+    gamma: FloatArray,
+    costs: FloatArray,
+    max_improvements: int = MAX_IMPROVEMENTS,
 ) -> tuple[FloatArray, int, float]:
-    """The smallest q with ``q_i = r_i + gamma max_j (q_j - costs_ij)``, by policy iteration.
+    """The smallest q with ``q_i = r_i + gamma_i max_j (q_j - costs_ij)``, by policy iteration.
 
     Args:
         rewards: (n,).
-        gamma: discount.
+        gamma: (n,) discounts; zero where nothing follows.
         costs: (n, n) Lipschitz constant times the distance from successor i to sample j.
         max_improvements: largest number of policy improvements.
 
@@ -140,7 +143,7 @@ def sample_bounds(
     improvements = 0
     while True:
         improvements += 1
-        chain = coo_array((np.full(n, gamma), (rows, maximiser)), shape=(n, n))
+        chain = coo_array((gamma, (rows, maximiser)), shape=(n, n))
         q = spsolve((eye_array(n) - chain).tocsc(), rewards - gamma * costs[rows, maximiser])
         values = q - costs
         improved = values.argmax(axis=1)

@@ -107,7 +107,8 @@ def update(
     rewards, unit = standardise(data.rewards)
     candidates = candidate_actions(task, settings.actions)
     gamma = 1.0 - settings.restart_probability
-    q = iterate_values(model, data, rewards, candidates, settings.temperature, gamma)
+    no_reward = -float(data.rewards.max()) / unit  # reward zero, standardised
+    q = iterate_values(model, data, rewards, no_reward, candidates, settings.temperature, gamma)
     clock.lap("sweeps")
     policy = SoftmaxPolicy(
         task,
@@ -162,11 +163,14 @@ def iterate_values(
     model: KernelEmbedding,
     data: Transitions,
     rewards: FloatArray,
+    no_reward: float,
     candidates: FloatArray,
     temperature: float,
     gamma: float,
 ) -> QFunction:
     """The fixed point of ``Q(s, a) = sum_i beta_i(s, a) (r_i + gamma V(s'_i))``.
+
+    After a termination there is no reward, so V(s') is then that of reward zero in each step.
 
     Far from the data the strengths beta vanish, and a sum over them would predict zero.  So they
     are applied to the targets less their mean, which Q approaches there.
@@ -175,6 +179,7 @@ def iterate_values(
         model: embedding on states and scaled actions, fitted to ``data``.
         data: n transitions.
         rewards: (n,), standardised.
+        no_reward: reward zero, standardised, of each step after a termination.
         candidates: (k, da) scaled actions.
         temperature: of the soft maximum; zero for the maximum.
         gamma: discount.
@@ -186,12 +191,15 @@ def iterate_values(
     actions = model.kernel.part(slice(-da, None)).gram(model.inputs, padded)  # (n, k)
     # Strengths may sum to more than one.  Returns beyond those of the extreme rewards are clipped,
     # or V could diverge.
-    min_return, max_return = rewards.min() / (1.0 - gamma), rewards.max() / (1.0 - gamma)
+    after_end, has_ends = no_reward / (1.0 - gamma), bool(data.terminated.any())
+    range_of = np.append(rewards, no_reward) if has_ends else rewards
+    min_return, max_return = range_of.min() / (1.0 - gamma), range_of.max() / (1.0 - gamma)
     values = np.zeros(len(data.points))
     sweeps = 0
     while True:
         sweeps += 1
-        targets = rewards + gamma * successor_features(data, values)
+        following = np.where(data.terminated, after_end, values[data.successor])
+        targets = rewards + gamma * following
         offset = float(targets.mean())
         table = model.factor.solve(targets - offset)[:, None] * actions
         maxima = soft_maximum(offset + states @ table, temperature)
@@ -201,5 +209,11 @@ def iterate_values(
         values = new_values
         if change <= CHANGE_TOLERANCE or sweeps == MAX_SWEEPS:
             # the shape of V has converged; further sweeps would add a geometric series to its level
-            offset += float(difference.mean()) * gamma / (1.0 - gamma)
-            return QFunction(table, offset, sweeps, change)
+            mean_change = float(difference.mean())
+            level = mean_change * gamma / (1.0 - gamma)
+            if not has_ends:
+                return QFunction(table, offset + level, sweeps, change)
+            # the value after a termination does not move with the level, so it is compared again
+            if abs(mean_change) <= CHANGE_TOLERANCE or sweeps == MAX_SWEEPS:
+                return QFunction(table, offset, sweeps, change)
+            values = np.clip(values + level, min_return, max_return)
