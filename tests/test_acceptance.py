@@ -16,6 +16,8 @@ from kreps.kernels.arrays import FloatArray
 from kreps.models.dynamics import fit_dynamics
 from kreps.models.model_env import ModelEnv, ModelRollouts
 from kreps.models.novelty import NoveltyBonus
+from kreps.models.reward_model import RewardModel
+from kreps.models.terminations import Terminations
 from kreps.models.transition import state_kernel
 from kreps.models.world_model import WorldModel
 from kreps.presets import settings_of
@@ -102,7 +104,7 @@ def learnt_env() -> ModelEnv:
     data, rng = Transitions.from_rollouts(wheel()), np.random.default_rng(0)
     kernel = state_kernel(data, TASK, rng)
     dynamics, *_ = fit_dynamics(data, kernel, TASK, None, rng)
-    return ModelEnv(dynamics, data, kernel, TASK, 0.02, 0.5, 20)
+    return ModelEnv(dynamics, data, kernel, TASK, 0.02, 0.5, 20, 0.0)
 
 
 def world_of(model_env: ModelEnv, rewards: FloatArray, reward_model: Any) -> WorldModel:
@@ -112,9 +114,12 @@ def world_of(model_env: ModelEnv, rewards: FloatArray, reward_model: Any) -> Wor
         features=np.zeros((2, 1)),
         phi=lambda states: states,
         restart=np.zeros(1),
-        rewards=rewards,
         expected_features=lambda rows, inputs: inputs,
-        reward_model=reward_model,
+        dynamics=model_env.dynamics,
+        terminations=None,
+        reward_model=RewardModel(
+            reward_model, float(rewards.mean()), 0.0, float(rewards.min()), float(rewards.max())
+        ),
         model_env=model_env,
         bonus=None,
     )
@@ -147,6 +152,16 @@ def test_a_policy_that_leaves_the_explored_region_is_rejected() -> None:
     # similarities are relative to the typical one of the previous policy
     assert acceptance(Policy(2.0, similarity=1e-3), Policy(1.0, similarity=1e-3)) is False
     assert acceptance(Policy(2.0, similarity=0.0), Policy(1.0, similarity=0.0)) is False
+
+
+def test_where_episodes_terminate_a_policy_may_leave_the_explored_region() -> None:
+    # living longer leads to new states, for which a policy must not be rejected
+    env = learnt_env()
+    ends = Terminations(lambda successors: np.zeros((len(successors), 1)), np.zeros(120), 0.0)
+    env = replace(env, dynamics=replace(env.dynamics, terminations=ends))
+    env = ModelOfReturns(**{field.name: getattr(env, field.name) for field in fields(env)})
+    assert acceptance(Policy(2.0, similarity=0.5), Policy(1.0), model_env=env) is False
+    assert acceptance(Policy(1.0, similarity=0.5), Policy(2.0), model_env=env) is True
 
 
 def test_with_an_exploration_bonus_an_unexplored_region_pays_the_optimistic_reward() -> None:

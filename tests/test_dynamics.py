@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,6 +23,7 @@ from kreps.models.dynamics import (
     linear_least_squares,
     state_changes,
 )
+from kreps.models.terminations import Terminations, fit_terminations
 from kreps.models.transition import state_actions, state_kernel
 
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]))
@@ -68,7 +71,6 @@ def test_coordinates_that_share_a_lengthscale_share_a_scale() -> None:
     delta_targets = DeltaStateTargets.fit(data, task)
     np.testing.assert_allclose(delta_targets.scale, [12.5**0.5, 12.5**0.5, 0.5, 1.0])
     targets = delta_targets.targets(data, task)
-    np.testing.assert_array_equal(targets[:, -1], [0.0, 1.0])
     np.testing.assert_allclose(delta_targets.changes(targets), state_changes(data, task))
     assert not delta_targets.coefficients.any()  # two samples are too few for a linear mean
 
@@ -98,12 +100,11 @@ def test_actions_that_hardly_vary_have_no_slope() -> None:
     assert abs(slopes[2, 0]) < 0.02
 
 
-def test_angles_and_terminations_have_no_slopes() -> None:
+def test_angles_have_no_slopes() -> None:
     task = TaskSpec(2, np.array([-2.0]), np.array([2.0]), periodic=(0,))
     slopes = DeltaStateTargets.fit(pushes(20, ended=True), task).coefficients
     assert not slopes[1].any()
-    assert not slopes[:, -1].any()
-    assert slopes[2:, :-1].all()
+    assert slopes[2:].all()
 
 
 def test_a_constant_coordinate_has_no_slope() -> None:
@@ -222,16 +223,16 @@ def velocity_alone(kernel: Kernel) -> Kernel:
     return Kernel((SquaredExponential((1,)),), kernel.lengthscales[1:])
 
 
-def test_a_termination_leads_to_the_start() -> None:
+def test_a_termination_leads_to_the_restart() -> None:
     data = pushes(ended=True)
     kernel, basis, features = basis_of(data)
     start = features[data.start].mean(axis=0)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
 
-    def always(inputs: FloatArray) -> FloatArray:
-        return np.full((len(inputs), 3), 1.7)  # a probability above one
+    def always(successors: FloatArray) -> FloatArray:
+        return np.full((len(successors), 1), 1.7)  # a probability above one
 
-    certain = Dynamics(dynamics.delta_targets, always, dynamics.loo_residuals)
+    certain = replace(dynamics, terminations=Terminations(always, np.zeros(len(data)), 0.0))
     found = certain.expected_features(basis, start, np.arange(9), state_actions(data, TASK)[:9])
     np.testing.assert_allclose(found, np.tile(start, (9, 1)), atol=1e-12)
 
@@ -275,7 +276,7 @@ def test_terminations_beyond_a_line_are_predicted() -> None:
     data = Transitions.from_rollouts(rollouts)
     kernel, basis, _ = basis_of(data)
     dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, np.random.default_rng(1))
-    far, near = (dynamics.regression(np.array([[0.0, 0.0, a]]))[0, -1] for a in (0.9, -0.9))
+    far, near = (dynamics.predict(np.array([[0.0, 0.0, a]]))[1][0] for a in (0.9, -0.9))
     assert far > 0.7 > 0.3 > near
     start = np.full(basis.lower.shape[0], 9.0)
     inputs = np.array([[0.0, 0.0, 0.9], [0.0, 0.0, -0.9]])
@@ -304,18 +305,22 @@ def test_expected_features_of_chunks_average_the_observation_and_its_mirror_imag
     start = features[data.start].mean(axis=0)
     regression = FeatureRegression(dynamics.regression, 0.0)
     state_features = StateFeatures(basis, start, as_float)
-    own, expected = PredictedSuccessors(state_features, dynamics.delta_targets, regression, TASK)(
-        data
-    )
+    terminations = fit_terminations(data, kernel, np.random.default_rng(3))
+    assert (terminations is not None) == ended
+    own, expected = PredictedSuccessors(
+        state_features, dynamics.delta_targets, regression, TASK, terminations
+    )(data)
     np.testing.assert_allclose(own, features[data.state], atol=1e-8)
     predicted = model.expected_features(dynamics.delta_targets.targets(data, TASK))
     predicted += dynamics.delta_targets.linear_mean(state_actions(data, TASK))
     predict = data.states + dynamics.delta_targets.changes(predicted)
     mirrored = basis.features(2.0 * predict - data.points[data.successor])
     spread = 0.5 * (features[data.successor] + mirrored)
-    ends = np.clip(predicted[:, -1:], 0.0, 1.0)
-    assert (ends.max() > 0.01) == ended
-    np.testing.assert_allclose(expected, spread + ends * (start - spread), atol=1e-6)
+    if terminations is not None:  # from the observed successor
+        ends = terminations.probabilities(data.points[data.successor])[:, None]
+        assert ends.max() > 0.01
+        spread = spread + ends * (start - spread)
+    np.testing.assert_allclose(expected, spread, atol=1e-6)
 
 
 def test_rounding_errors_are_not_scaled_up() -> None:

@@ -20,6 +20,7 @@ from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray
 from kreps.models.novelty import NoveltyBonus
+from kreps.models.reward_model import RewardModel
 from kreps.models.transition import feature_differences, state_actions
 from kreps.models.world_model import WorldModel
 from kreps.presets import settings_of
@@ -85,14 +86,19 @@ class Case:
         weights: FloatArray | None = None,
         source: StateSource = StateSource.REPLAY,
         tested: bool = False,
-        reward_model: Callable[[FloatArray], FloatArray] | None = None,
+        regression: Callable[[FloatArray], FloatArray] | None = None,
         **changes: Any,
     ) -> GeneratedSamples:
-        """With uniform weights, if none are given, a ridge of 0.3, and without a bonus."""
+        """With uniform weights, if none are given, a ridge of 0.3, and without a bonus.
+
+        Args:
+            regression: of the reward, in place of the learnt one and without terminations.
+        """
         n = len(self.world.states)
         world = replace(self.world, bonus=None)
-        if reward_model is not None:
-            world = replace(world, reward_model=reward_model)
+        if regression is not None:
+            without = replace(world.reward_model, regression=regression, at_termination=0.0)
+            world = replace(world, reward_model=without)
         return generate(
             world,
             np.full(n, 1.0 / n) if weights is None else weights,
@@ -125,10 +131,13 @@ def test_sampled_actions_have_the_differences_and_rewards_of_the_first_step(mode
     wanted = feature_differences(world.features, case.step.model.expected, world.restart, p)
     assert np.abs(wanted).max() > 0.1
     np.testing.assert_allclose(found.problem.differences, wanted, atol=1e-8)
-    predicted = world.rewards.mean() + world.reward_model(state_actions(data, TASK))[:, 0]
-    predicted = np.clip(predicted, world.rewards.min(), world.rewards.max())
-    np.testing.assert_allclose(found.problem.rewards, predicted - predicted.max(), atol=1e-8)
-    assert np.corrcoef(predicted, world.rewards)[0, 1] > 0.9
+    assert world.terminations is not None
+    ends = world.terminations(state_actions(data, TASK))
+    np.testing.assert_allclose(found.terminations, ends, atol=1e-8)
+    predicted = world.reward_model(state_actions(data, TASK), ends)
+    np.testing.assert_allclose(found.problem.rewards, predicted, atol=1e-8)
+    np.testing.assert_array_equal(found.rewards, found.problem.rewards)  # there is no bonus
+    assert np.corrcoef(predicted, case.batch.rewards)[0, 1] > 0.9
 
 
 def test_bounds_and_ridge_are_those_of_the_settings() -> None:
@@ -150,11 +159,11 @@ def test_the_model_predicts_for_the_applied_actions_and_the_samples_are_commande
     commanded = np.linspace(-5.0, 5.0, n)[:, None]
     recorded: list[FloatArray] = []
 
-    def reward_model(inputs: FloatArray) -> FloatArray:
+    def regression(inputs: FloatArray) -> FloatArray:
         recorded.append(inputs)
         return np.zeros((len(inputs), 1))
 
-    found = case.generate(GivenActions(commanded), reward_model=reward_model, **replayed(1))
+    found = case.generate(GivenActions(commanded), regression=regression, **replayed(1))
     np.testing.assert_array_equal(found.actions, commanded)
     (inputs,) = recorded
     np.testing.assert_array_equal(inputs[:, :2], case.world.states)
@@ -163,17 +172,16 @@ def test_the_model_predicts_for_the_applied_actions_and_the_samples_are_commande
 
 def test_expected_rewards_are_clipped_to_the_observed_range() -> None:
     case = Case.learnt(model="change")
-    n, rewards = len(case.world.states), case.world.rewards
+    n, rewards = len(case.world.states), case.batch.rewards
     overshooting = np.linspace(-100.0, 100.0, n)
     found = case.generate(
         GivenActions(np.zeros((n, 1))),
-        reward_model=lambda inputs: overshooting[:, None],
+        regression=lambda inputs: overshooting[:, None],
         **replayed(1),
     ).problem.rewards
-    assert found.max() == 0.0
-    assert found.min() == pytest.approx(-np.ptp(rewards))
+    assert (found.min(), found.max()) == (rewards.min(), rewards.max())
     wanted = np.clip(rewards.mean() + overshooting, rewards.min(), rewards.max())
-    np.testing.assert_allclose(found, wanted - wanted.max(), atol=1e-12)
+    np.testing.assert_allclose(found, wanted, atol=1e-12)
 
 
 @pytest.mark.parametrize("scale", [0.5, 3.0, 50.0])
@@ -181,8 +189,8 @@ def test_rewards_of_any_actions_are_within_the_observed_range(scale: float) -> N
     case = Case.learnt(model="change")
     actions = scale * np.random.default_rng(7).normal(size=(5 * len(case.world.states), 1))
     rewards = case.generate(GivenActions(actions), **replayed(5)).problem.rewards
-    assert rewards.max() == 0.0
-    assert rewards.min() >= -np.ptp(case.world.rewards) - 1e-12
+    assert rewards.max() <= case.batch.rewards.max()
+    assert rewards.min() >= case.batch.rewards.min()
 
 
 # ---- states and actions -----------------------------------------------------------------------
@@ -280,9 +288,12 @@ def still_world(model_env: Any, n: int = 120, bonus: NoveltyBonus | None = None)
         features=np.zeros((n, 2)),
         phi=lambda states: states,
         restart=np.array([3.0, -1.0]),
-        rewards=np.linspace(-3.0, 0.0, n),
         expected_features=lambda rows, inputs: inputs[:, :2],
-        reward_model=lambda inputs: np.full((len(inputs), 1), 1.5),
+        dynamics=None if model_env is None else getattr(model_env, "dynamics", None),
+        terminations=None,
+        reward_model=RewardModel(
+            lambda inputs: np.full((len(inputs), 1), 1.5), -1.5, 0.0, -3.0, 0.0
+        ),
         model_env=model_env,
         bonus=bonus,
     )
@@ -332,7 +343,9 @@ def test_a_limited_number_of_actions_is_generated() -> None:
 
 def test_an_unexplored_successor_adds_the_bonus_and_is_followed_by_a_restart() -> None:
     model_env: Any = SimpleNamespace(
-        dynamics=SimpleNamespace(predict=lambda inputs: (inputs[:, :2], np.zeros((4, 1)))),
+        dynamics=SimpleNamespace(
+            predict=lambda inputs: (inputs[:, :2], np.zeros(4)), terminations=None
+        ),
         # every second generated action leads to an unexplored state
         nearest=lambda states: (None, np.array([1.0, 0.0, 1.0, 0.0])),
     )
@@ -352,9 +365,8 @@ def test_an_unexplored_successor_adds_the_bonus_and_is_followed_by_a_restart() -
         for each in (None, bonus)
     )
     p = 0.02
-    gained = found.rewards - found.rewards.min()
-    np.testing.assert_allclose(gained, [0.0, 2.0 * (1.0 - p) / p] * 2)
-    assert found.rewards.max() == 0.0 and not without.rewards.any()
+    np.testing.assert_allclose(found.rewards, [0.0, 2.0 * (1.0 - p) / p] * 2)
+    assert not without.rewards.any()
     np.testing.assert_array_equal(found.differences[::2], without.differences[::2])
     # the features of the state are zero, so these are the features after a restart
     np.testing.assert_allclose(found.differences[1::2], [[3.0, -1.0]] * 2)

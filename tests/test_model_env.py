@@ -14,6 +14,7 @@ from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Kernel
 from kreps.models.dynamics import DeltaStateTargets, Dynamics, fit_dynamics
 from kreps.models.model_env import ModelEnv, average_reward, supports_model_rollouts
+from kreps.models.terminations import Terminations
 from kreps.models.transition import state_kernel
 
 TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]), periodic=(0,))
@@ -53,9 +54,14 @@ class Push:
         return np.full((len(states), 1), self.force)
 
 
+def always(termination: float, count: int) -> Terminations:
+    """The same probability of a termination everywhere."""
+    return Terminations(lambda s: np.full((len(s), 1), termination), np.zeros(count), 0.0)
+
+
 def model_env(
     step: FloatArray | None = None,
-    termination: float = 0.0,
+    termination: float | None = None,
     loo_residuals: float = 0.0,
     **changes: Any,
 ) -> ModelEnv:
@@ -65,17 +71,17 @@ def model_env(
     ``loo_residuals``.
     """
     data = Transitions.from_rollouts(turns())
-    coefficients = np.zeros((4, 3))
-    coefficients[3, :2] = np.array([0.1, 0.02]) if step is None else step
-    coefficients[0, 2] = termination
+    coefficients = np.zeros((4, 2))
+    coefficients[3] = np.array([0.1, 0.02]) if step is None else step
     rows = np.arange(len(data))[:, None]
     dynamics = Dynamics(
         DeltaStateTargets(np.ones(2), coefficients),
-        lambda inputs: np.zeros((len(inputs), 3)),
-        loo_residuals * (rows + 1.0) + np.zeros(3),
+        lambda inputs: np.zeros((len(inputs), 2)),
+        loo_residuals * (rows + 1.0) + np.zeros(2),
+        None if termination is None else always(termination, len(data)),
     )
     kernel = Kernel(TASK.state_factors, np.array([0.5, 0.5]))
-    return replace(ModelEnv(dynamics, data, kernel, TASK, 0.1, 0.0, 20), **changes)
+    return replace(ModelEnv(dynamics, data, kernel, TASK, 0.1, 0.0, 20, 0.0), **changes)
 
 
 def as_set(states: FloatArray) -> set[tuple[float, ...]]:
@@ -185,7 +191,7 @@ def test_a_learnt_model_visits_the_states_to_which_the_policy_pushes() -> None:
     rng = np.random.default_rng(9)
     kernel = state_kernel(data, TASK, rng)
     dynamics, *_ = fit_dynamics(data, kernel, TASK, None, rng)
-    env = ModelEnv(dynamics, data, kernel, TASK, 0.02, 0.0, 20)
+    env = ModelEnv(dynamics, data, kernel, TASK, 0.02, 0.0, 20, 0.0)
     right, _ = env.visited_states(Push(2.0), 400, rng)
     left, _ = env.visited_states(Push(-2.0), 400, rng)
     assert right[:, 1].mean() > 0.5 and left[:, 1].mean() < -0.2
@@ -215,7 +221,7 @@ def test_there_are_no_model_rollouts_in_images() -> None:
 # ---- evaluation -------------------------------------------------------------------------------
 
 
-def angle(inputs: FloatArray) -> FloatArray:
+def angle(inputs: FloatArray, terminations: FloatArray) -> FloatArray:
     return inputs[:, 0]
 
 
@@ -255,16 +261,31 @@ def test_an_evaluation_has_two_mean_lengths_up_to_the_longest_rollout(
 
 def test_rewards_are_those_of_the_applied_actions() -> None:
     env = model_env(kernel=ALL_SIMILAR)
-    found = average_rewards(env, Push(50.0), lambda inputs: inputs[:, 2], 3)
+    found = average_rewards(env, Push(50.0), lambda inputs, _: inputs[:, 2], 3)
     np.testing.assert_allclose(found, 1.0)
 
 
-def test_after_a_termination_the_process_restarts() -> None:
-    policy, env = Push(), model_env(termination=1.0)
-    average_rewards(env, policy, angle, 30)
-    assert len(policy.steps) == 20
-    for states in policy.steps:
-        assert as_set(states) == as_set(STARTS)
+def test_after_a_termination_nothing_more_is_earned() -> None:
+    # each step earns 1, and a termination 5 more; zero is -2 in standardised units
+    def reward(inputs: FloatArray, terminations: FloatArray) -> FloatArray:
+        return 1.0 + 5.0 * terminations
+
+    env = model_env(termination=1.0, end_reward=-2.0)
+    (found,) = env.evaluate([Push()], reward, 30, np.random.default_rng(0))
+    np.testing.assert_array_equal(found.rewards[0], np.full(30, 6.0))
+    np.testing.assert_array_equal(found.rewards[1:], np.full((19, 30), -2.0))
+    assert not found.ended[0].any() and found.ended[1:].all()
+
+    env = model_env(termination=0.25, end_reward=-2.0, max_steps=20)
+    (found,) = env.evaluate([Push()], reward, 4000, np.random.default_rng(0))
+    shares = 1.0 - found.ended.mean(axis=1)
+    np.testing.assert_allclose(shares, 0.75 ** np.arange(20), atol=0.03)
+    np.testing.assert_array_equal(found.rewards, np.where(found.ended, -2.0, 2.25))
+
+
+def test_without_a_termination_no_rollout_ends() -> None:
+    (found,) = model_env(end_reward=-2.0).evaluate([Push()], angle, 30, np.random.default_rng(0))
+    assert not found.ended.any()
 
 
 def test_policies_are_compared_with_common_random_numbers() -> None:
@@ -274,10 +295,10 @@ def test_policies_are_compared_with_common_random_numbers() -> None:
     together = env.evaluate([*map(Push, forces)], angle, 20, np.random.default_rng(0))
     for force, found in zip(forces, together, strict=True):
         (alone,) = env.evaluate([Push(force)], angle, 20, np.random.default_rng(0))
-        np.testing.assert_array_equal(found.terminated, alone.terminated)
+        np.testing.assert_array_equal(found.ended, alone.ended)
         np.testing.assert_allclose(found.rewards, alone.rewards)
         np.testing.assert_allclose(found.similarity, alone.similarity)
-    assert 0 < together[0].terminated.sum() < together[0].terminated.size
+    assert 0 < together[0].ended.sum() < together[0].ended.size
     assert not np.allclose(together[0].rewards, together[2].rewards)
     (other,) = env.evaluate([Push(0.0)], angle, 20, np.random.default_rng(1))
     assert not np.allclose(other.rewards, together[1].rewards)
@@ -287,7 +308,7 @@ def test_rewards_far_from_the_samples_are_shrunk_towards_the_smallest() -> None:
     env = model_env(step=np.array([3.0, 0.0]), kernel=Kernel(TASK.state_factors, np.ones(2)))
     policy = Push(2.0)  # three radians per step, at a speed that was observed
     found = average_rewards(
-        env, policy, lambda inputs: np.full(len(inputs), 5.0), 4, smallest=-7.0, typical=0.8
+        env, policy, lambda inputs, _: np.full(len(inputs), 5.0), 4, smallest=-7.0, typical=0.8
     )
     similarity = np.array(
         [env.kernel.gram(states, env.data.states).max(axis=1) for states in policy.steps]

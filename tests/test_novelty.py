@@ -17,6 +17,7 @@ from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Kernel
 from kreps.models.model_env import ModelRollouts
 from kreps.models.novelty import NoveltyBonus, novelty_bonus, novelty_radius
+from kreps.models.reward_model import RewardModel
 from kreps.models.world_model import WorldModel
 
 TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
@@ -124,11 +125,11 @@ def test_an_unexplored_region_is_absorbing_in_model_rollouts() -> None:
     found = bonus.optimistic_rewards(ModelRollouts(rewards, similarity, never))
     wanted = [[0.0, 1.0], [2.0, (3.0 + 7.0) / 2], [7.0, (5.0 + 7.0) / 2], [7.0, 7.0]]
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
-    # after a termination nothing is absorbed any more
-    terminated = never.copy()
-    terminated[2] = True
-    found = bonus.optimistic_rewards(ModelRollouts(rewards, similarity, terminated))
-    np.testing.assert_allclose(found, [*wanted[:3], [6.0, 7.0]], rtol=1e-12)
+    # after a termination nothing more is absorbed; what was absorbed before stays
+    ended = never.copy()
+    ended[2:] = True
+    found = bonus.optimistic_rewards(ModelRollouts(rewards, similarity, ended))
+    np.testing.assert_allclose(found, [*wanted[:2], [4.0, 6.0], [6.0, 7.0]], rtol=1e-12)
 
 
 def test_the_bonus_decays_with_each_update_until_it_is_left_out() -> None:
@@ -166,16 +167,19 @@ def test_the_optimistic_reward_is_at_most_two_deviations_above_the_mean() -> Non
 # ---- in a model -------------------------------------------------------------------------------
 
 
-def world_of(model_env: Any, reward_model: Any = None, rewards: Any = (-3.0, 0.0)) -> WorldModel:
+def world_of(
+    model_env: Any, reward_model: Any = None, rewards: Any = (-3.0, -1.0, 0.0)
+) -> WorldModel:
     return WorldModel(
         task=TASK,
         states=np.zeros((2, 2)),
         features=np.zeros((2, 2)),
         phi=lambda states: states,
         restart=np.array([3.0, -1.0]),
-        rewards=np.asarray(rewards),
         expected_features=lambda rows, inputs: inputs[:, :2],
-        reward_model=reward_model,
+        dynamics=None if model_env is None else model_env.dynamics,
+        terminations=None,
+        reward_model=RewardModel(lambda inputs: inputs[:, :1], 0.0, 0.0, -3.0, 0.0),
         model_env=model_env,
         bonus=NoveltyBonus(optimistic_reward=0.0, average_reward=-2.0, known_radius=0.5),
     )
@@ -183,7 +187,7 @@ def world_of(model_env: Any, reward_model: Any = None, rewards: Any = (-3.0, 0.0
 
 def test_novelty_is_that_of_the_successor_unless_the_task_terminates() -> None:
     similarity = np.array([1.0, 0.0, 0.0, 0.0])
-    termination = np.array([[0.0], [0.0], [1.0], [0.25]])
+    termination = np.array([0.0, 0.0, 1.0, 0.25])
     inputs = np.ones((4, 3))
 
     def nearest(states: FloatArray) -> tuple[None, FloatArray]:
@@ -191,22 +195,37 @@ def test_novelty_is_that_of_the_successor_unless_the_task_terminates() -> None:
         return None, similarity
 
     env = SimpleNamespace(
-        dynamics=SimpleNamespace(predict=lambda inputs: (inputs[:, :2] + 1.0, termination)),
+        dynamics=SimpleNamespace(
+            predict=lambda inputs: (inputs[:, :2] + 1.0, termination), terminations=object()
+        ),
         nearest=nearest,
     )
     world = world_of(env)
-    np.testing.assert_allclose(world.novelty(inputs), [0.0, 1.0, 0.0, 0.75])
+    found, novelty = world.terminations_and_novelty(inputs)
+    np.testing.assert_array_equal(found, termination)
+    np.testing.assert_allclose(novelty, [0.0, 1.0, 0.0, 0.75])
     for without in (replace(world, model_env=None), replace(world, bonus=None)):
-        np.testing.assert_array_equal(without.novelty(inputs), np.zeros(4))
+        found, novelty = without.terminations_and_novelty(inputs)
+        np.testing.assert_array_equal(found, termination)
+        np.testing.assert_array_equal(novelty, np.zeros(4))
+    # an embedding predicts no successors, but terminations of actions
+    embedded = replace(world, dynamics=None, terminations=lambda inputs: 0.5 * inputs[:, 0])
+    found, novelty = embedded.terminations_and_novelty(inputs)
+    np.testing.assert_array_equal(found, np.full(4, 0.5))
+    np.testing.assert_array_equal(novelty, np.zeros(4))
 
 
 def test_expected_rewards_are_the_mean_plus_the_model_clipped_to_the_observed_range() -> None:
     inputs = np.random.default_rng(0).normal(size=(50, 3))
-    world = world_of(None, lambda inputs: 2.0 * inputs[:, :1], rewards=[-3.0, -1.0, 0.0])
+    model = RewardModel(lambda inputs: 2.0 * inputs[:, :1], -4.0 / 3.0, 0.8, -3.0, 0.0)
     predicted = -4.0 / 3.0 + 2.0 * inputs[:, 0]
-    found = world.expected_rewards(inputs)
+    found = model(inputs, np.zeros(50))
     np.testing.assert_allclose(found, np.clip(predicted, -3.0, 0.0))
     assert (found.min(), found.max()) == (-3.0, 0.0)
+    # a termination adds a constant, by its probability
+    probabilities = np.linspace(0.0, 1.0, 50)
+    found = model(inputs, probabilities)
+    np.testing.assert_allclose(found, np.clip(predicted + 0.8 * probabilities, -3.0, 0.0))
 
 
 def angle_of_the_highest_eighth(bonus: float) -> float:

@@ -45,7 +45,7 @@ def transitions(count: int = 24, ds: int = 2, da: int = 1) -> Transitions:
 def generated(states: FloatArray, state_of: IntArray, actions: FloatArray) -> GeneratedSamples:
     n = len(actions)
     problem = DualProblem(np.zeros(n), np.zeros((n, 1)), 1.0, 1.0, 1.0)
-    return GeneratedSamples(states, state_of, actions, problem)
+    return GeneratedSamples(states, state_of, actions, problem, np.zeros(n), np.zeros(n))
 
 
 # ---- targets ----------------------------------------------------------------------------------

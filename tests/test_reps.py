@@ -195,10 +195,23 @@ def test_the_weights_are_the_exponentials_of_the_bellman_errors(
         gram = np.exp(-0.5 * squares)
         noise = info.embedding_parameters[-1] * np.eye(len(gram))
         expected = gram @ np.linalg.solve(gram + noise, expected)
+    ends = np.concatenate([[*[False] * (len(r) - 1), r.terminated] for r in rollouts])
+    # the deviation of all rewards, zeros after terminations included
+    steps = (1.0 - restart) / restart
+    share = np.append(np.full(len(ends), 1.0), steps * ends.sum())
+    scatter = np.average(np.append(rewards, 0.0) ** 2, weights=share)
+    unit = np.sqrt(scatter - np.average(np.append(rewards, 0.0), weights=share) ** 2)
     delta = rewards + (1.0 - restart) * expected + restart * at_start - v(states)
-    wanted = np.exp((delta - delta.max()) / (info.dual.eta * rewards.std()))
+    p, scale = info.dual.weights, info.dual.eta * unit
+    # the value of a termination, from the heaviest sample with and without one
+    i, j = np.where(ends, p, 0.0).argmax(), np.where(ends, 0.0, p).argmax()
+    value = scale * (np.log(p[i]) - np.log(p[j])) - (delta[i] - delta[j])
+    average = p @ rewards / (1.0 + steps * p @ ends)
+    assert value == pytest.approx(steps * (0.0 - average), abs=0.02 * unit)
+    delta = delta + value * ends
+    wanted = np.exp((delta - delta.max()) / scale)
     wanted /= wanted.sum()
-    assert np.abs(info.dual.weights - wanted).sum() < 1e-5
+    assert np.abs(p - wanted).sum() < 1e-5
 
 
 def test_the_policy_is_the_weighted_gaussian_process_of_the_commanded_actions() -> None:

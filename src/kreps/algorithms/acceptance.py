@@ -6,7 +6,9 @@ previous policy acts again where the new one is worse.
 
 Far from the samples the model predicts an average reward, which late in learning is a good one.
 So rewards of states that are unlike any sample are shrunk towards the smallest one observed.  While
-there is an exploration bonus, these states get that bonus instead.
+there is an exploration bonus, these states get that bonus instead.  Rewards are not shrunk where
+episodes terminate: a policy that avoids the termination for longer visits new states, and would be
+rejected for it.
 """
 
 from __future__ import annotations
@@ -53,12 +55,15 @@ def rejects(
     if previous is None or world.model_env is None or not rollouts:
         return None
     model_env = replace(world.model_env, exploring_starts=0.0)
-    of_new, of_previous = model_env.evaluate((new, previous), world.expected_rewards, rollouts, rng)
+    of_new, of_previous = model_env.evaluate((new, previous), world.reward_model, rollouts, rng)
+    can_terminate = model_env.dynamics.terminations is not None
     typical = max(float(np.median(of_previous.similarity)), np.finfo(np.float64).tiny)
 
     def returns(each: ModelRollouts) -> FloatArray:
-        if world.bonus is None:
-            rewards = each.pessimistic_rewards(world.rewards.min(), typical)
+        if world.bonus is None and can_terminate:
+            rewards = each.rewards
+        elif world.bonus is None:
+            rewards = each.pessimistic_rewards(world.reward_model.smallest, typical)
         else:
             rewards = world.bonus.optimistic_rewards(each)
         return average_reward(rewards, model_env.restart_probability)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 
 import numpy as np
 
-from kreps.algorithms.dual import DualProblem, DualSolution, standardise
-from kreps.algorithms.newton import solve_dual
+from kreps.algorithms.dual import DualProblem, DualSolution
+from kreps.algorithms.ends import AbsorbingEnd, solve_with_end, standardise_with_end
 from kreps.algorithms.policy_targets import (
     PolicyFit,
     PolicyTargets,
@@ -22,13 +22,20 @@ from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis
 from kreps.kernels.kernel import Kernel
-from kreps.models.dynamics import expected_features_of_samples, fit_dynamics
+from kreps.models.dynamics import (
+    expected_features_of_samples,
+    fit_dynamics,
+    termination_probabilities_of_samples,
+)
+from kreps.models.reward_model import RewardModel, regressed_steps, reward_model
+from kreps.models.terminations import as_probabilities
 from kreps.models.transition import (
     embedding_origin,
     feature_differences,
     fit_embedding,
     fit_regression,
     restart_features,
+    state_actions,
     with_wrap_discontinuity,
 )
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT, CostSensitiveGP
@@ -51,7 +58,9 @@ class ExactBatch:
     ) -> None:
         self.window, self.task, self.settings, self.clock = window, window.task, settings, clock
         self.data = exact_transitions(window)
-        self.rewards, self.reward_unit = standardise(self.data.rewards)
+        self.rewards, self.reward_unit, self.end = standardise_with_end(
+            self.data.rewards, self.data.terminated, settings.restart_probability
+        )
         self.size, self.seen = len(self.data), (len(rollouts), sum(map(len, rollouts)))
         self.actions = np.concatenate([r.actions for r in rollouts or window.rollouts])
         self.jitters: list[float] = []
@@ -68,8 +77,11 @@ class ExactBatch:
                 kernel, data.points, tolerance=value.tolerance, max_rank=value.max_rank
             )
         self.clock.lap("basis")
-        start = phi[data.start].mean(axis=0)
-        return ValueFeatures(basis, phi[data.state], phi[data.successor], start)
+        own = phi[data.state]
+        restart = restart_features(
+            phi[data.start].mean(axis=0), own.mean(axis=0), self.settings.exploring_starts
+        )
+        return ValueFeatures(basis, own, phi[data.successor], restart)
 
     def transition_model(
         self,
@@ -96,12 +108,13 @@ class ExactBatch:
         dynamics, x, jitter = fit_dynamics(self.data, kernel, self.task, start, rng)
         self.jitters.append(jitter)
         self.clock.lap("embedding fit")
-        basis, after_end = features.basis, features.start
+        basis, restart = features.basis, features.restart
         expected, errors = expected_features_of_samples(
-            self.data, basis, features.own, features.observed, after_end, dynamics, self.task
+            self.data, basis, features.own, features.observed, restart, dynamics, self.task
         )
-        for_actions = partial(dynamics.expected_features, basis, after_end)
-        return Expectation(expected, errors, for_actions, x, dynamics)
+        for_actions = partial(dynamics.expected_features, basis, restart)
+        terminations = termination_probabilities_of_samples(self.data, dynamics)
+        return Expectation(expected, errors, for_actions, x, dynamics, terminations, None)
 
     def _embedding(
         self,
@@ -113,11 +126,12 @@ class ExactBatch:
         """Eq. 4 on the features of successors, as printed or less those of the state."""
         data, model = self.data, self.settings.model
         origin = embedding_origin(features.own, model)
-        observed = np.where(data.terminated[:, None], features.start, features.observed)
+        terminated = data.terminated.astype(np.float64)
+        observed = np.where(data.terminated[:, None], features.restart, features.observed)
         targets = observed - origin
         if model == "sample":
             self.clock.lap("embedding fit")
-            return Expectation(origin + targets, None, None, None, None)
+            return Expectation(origin + targets, None, None, None, None, terminated, None)
         embedding, x = fit_embedding(data, targets, kernel, self.task, start, rng)
         self.jitters.append(embedding.factor.jitter)
         self.clock.lap("embedding fit")
@@ -128,25 +142,26 @@ class ExactBatch:
             lambda rows, inputs: origin[rows] + predict(inputs),
             x,
             None,
+            terminated,
+            as_probabilities(embedding.predictor(terminated[:, None])) if self.end else None,
         )
 
     def solve_dual(
         self, features: ValueFeatures, model: Expectation, eta_floor: float
-    ) -> tuple[DualProblem, DualSolution]:
+    ) -> tuple[DualProblem, DualSolution, AbsorbingEnd | None]:
         settings, own = self.settings, features.own
-        restart = restart_features(features.start, own.mean(axis=0), settings.exploring_starts)
         problem = DualProblem(
             rewards=self.rewards,
             differences=feature_differences(
-                own, model.expected, restart, settings.restart_probability
+                own, model.expected, features.restart, settings.restart_probability
             ),
             kl_bound=settings.kl_bound,
             ridge=stationarity_ridge(settings, model.errors) / self.size,
             eta_floor=eta_floor,
         )
-        dual = solve_dual(problem)
+        problem, dual, end = solve_with_end(problem, model.terminations, self.end)
         self.clock.lap("dual")
-        return problem, dual
+        return problem, dual, end
 
     def fit_policy_to_data(
         self, p: FloatArray, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
@@ -181,13 +196,15 @@ class ExactBatch:
 
     def fit_reward(
         self, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
-    ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]:
+    ) -> tuple[RewardModel, FloatArray]:
         # a reward may jump where the dynamics are smooth, so it has lengthscales of its own
-        targets = (self.rewards - self.rewards.mean())[:, None]
-        kernel = with_wrap_discontinuity(kernel, self.data, self.task, self.settings.value)
-        regression, x = fit_regression(self.data, targets, kernel, self.task, start, rng)
+        data, rows = self.data, regressed_steps(self.data)
+        targets = (self.rewards - self.rewards.mean())[rows, None]
+        kernel = with_wrap_discontinuity(kernel, data, self.task, self.settings.value)
+        regression, x = fit_regression(data.rows(rows), targets, kernel, self.task, start, rng)
         self.jitters.append(regression.factor.jitter)
-        return regression.predictor(targets), x
+        predict, inputs = regression.predictor(targets), state_actions(data, self.task)
+        return reward_model(predict, self.rewards, data, inputs), x
 
     def weights_in_memory(self, p: FloatArray) -> FloatArray:
         return p

@@ -43,13 +43,18 @@ class GeneratedSamples:
         states: (k, ds).
         state_of: (m,) which of the states each action is taken in, in order.
         actions: (m, da) commanded, in the task's units.
-        problem: the dual, with expected rewards and feature differences.
+        problem: the dual, with expected rewards and feature differences, before the value of
+            terminations is added.
+        rewards: (m,) expected, standardised, without exploration bonus.
+        terminations: (m,) probabilities of a termination.
     """
 
     states: FloatArray
     state_of: IntArray
     actions: FloatArray
     problem: DualProblem
+    rewards: FloatArray
+    terminations: FloatArray
 
 
 def split_budget(world: WorldModel, model_based: ModelBased) -> dict[StateSource, int]:
@@ -102,21 +107,41 @@ def generate(
     actions = policy.act(states[state_of], noise)
     inputs = np.concatenate([states[state_of], task.scaled_applied(actions)], axis=1)
     p = settings.restart_probability
-    rewards, expected = expected_outcomes(world, rows[state_of], inputs, p)
+    outcomes = expected_outcomes(world, rows[state_of], inputs, p)
     problem = DualProblem(
-        rewards=rewards - rewards.max(),
-        differences=feature_differences(features[state_of], expected, world.restart, p),
+        rewards=outcomes.rewards + outcomes.bonus,
+        differences=feature_differences(features[state_of], outcomes.features, world.restart, p),
         kl_bound=settings.kl_bound,
         ridge=ridge / count,
         eta_floor=temperature_floor(tested, settings),
     )
-    return GeneratedSamples(states, state_of, actions, problem)
+    return GeneratedSamples(
+        states, state_of, actions, problem, outcomes.rewards, outcomes.terminations
+    )
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """What the model predicts of m actions.
+
+    Attributes:
+        rewards: (m,) standardised.
+        features: (m, r) of V at the successor; those of the restart after a termination, and in the
+            proportion of its novelty after a successor that is unlike any sample.
+        terminations: (m,) probabilities of a termination.
+        bonus: (m,) exploration bonus.
+    """
+
+    rewards: FloatArray
+    features: FloatArray
+    terminations: FloatArray
+    bonus: FloatArray
 
 
 def expected_outcomes(
     world: WorldModel, rows: IntArray, inputs: FloatArray, restart_probability: float
-) -> tuple[FloatArray, FloatArray]:
-    """Expected rewards (m,) and features (m, r) of successors, exploration bonus included.
+) -> Outcomes:
+    """Predictions for m actions.
 
     As in R-max, an unexplored region is an absorbing state that pays an optimistic reward until the
     restart.  Its total value is added to the reward of the action that leads there, and a restart
@@ -128,10 +153,11 @@ def expected_outcomes(
         inputs: (m, ds + da) states and scaled, applied actions.
         restart_probability: p.
     """
-    rewards = world.expected_rewards(inputs)
-    expected = world.expected_features(rows, inputs)
+    terminations, novelty = world.terminations_and_novelty(inputs)
+    rewards = world.reward_model(inputs, terminations)
+    features = world.expected_features(rows, inputs)
+    bonus = np.zeros(len(inputs))
     if world.bonus is not None:
-        novelty = world.novelty(inputs)
-        rewards = rewards + novelty * world.bonus.exploration_bonus(restart_probability)
-        expected = with_terminations(expected, novelty[:, None], world.restart)
-    return rewards, expected
+        bonus = novelty * world.bonus.exploration_bonus(restart_probability)
+        features = with_terminations(features, novelty[:, None], world.restart)
+    return Outcomes(rewards, features, terminations, bonus)

@@ -8,13 +8,14 @@ The cost is linear in the number of samples.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from functools import partial, reduce
 from operator import add
 
 import numpy as np
 
-from kreps.algorithms.dual import DualSolution, effective_sample_size, standardise
+from kreps.algorithms.dual import DualSolution, effective_sample_size
+from kreps.algorithms.ends import AbsorbingEnd, Start, solve_with_end, standardise_with_end
+from kreps.algorithms.newton import solve_dual
 from kreps.algorithms.policy_targets import (
     MIN_RELATIVE_WEIGHT,
     PolicyFit,
@@ -22,21 +23,23 @@ from kreps.algorithms.policy_targets import (
     exploration_noise,
     policy_hyperparameters,
 )
-from kreps.algorithms.reps import Expectation, ValueFeatures, stationarity_ridge
+from kreps.algorithms.reps import stationarity_ridge
 from kreps.algorithms.state import Stopwatch
 from kreps.algorithms.streamed_dual import StreamedProblem, coarse_to_fine
 from kreps.algorithms.streaming import (
     BellmanRows,
     ChunkPolicySums,
     ChunkRewards,
+    ChunkTerminations,
     DeltaStateSums,
     EmbeddedSuccessors,
     EmbeddingSums,
-    ExpectedSuccessors,
     ObservedSuccessors,
     PredictedSuccessors,
     StartFeatures,
     StateFeatures,
+    StreamedExpectation,
+    StreamedFeatures,
 )
 from kreps.data.compute import Compute
 from kreps.data.dataset import Chunk, Dataset
@@ -51,7 +54,14 @@ from kreps.models.dynamics import (
     DeltaStateTargets,
     Dynamics,
     expected_features_of_samples,
+    termination_probabilities_of_samples,
     with_terminations,
+)
+from kreps.models.reward_model import RewardModel, regressed_steps, reward_model
+from kreps.models.terminations import (
+    as_probabilities,
+    fit_terminations_in_features,
+    targets_of,
 )
 from kreps.models.transition import (
     embedding_hyperparameters,
@@ -70,22 +80,8 @@ RESIDUAL_TOLERANCE = 1e-6
 memory is at most this; the kernels are at most one."""
 
 
-@dataclass(frozen=True)
-class StreamedFeatures(ValueFeatures):
-    """Features of V at the samples in memory, and the function that computes those of a chunk."""
-
-    state_features: StateFeatures
-
-
-@dataclass(frozen=True)
-class StreamedExpectation(Expectation):
-    """Predictions for the samples in memory, and the model that computes those of a chunk."""
-
-    successors: ExpectedSuccessors
-
-
-Regressed = tuple[FeatureRegression, LeaveOneOut, FloatArray]
-"""A regression of all samples, its errors on those in memory, and its log hyper-parameters."""
+Regressed = tuple[FeatureRegression, LeaveOneOut, FloatArray, Basis]
+"""A regression of all samples, its errors on those in memory, log hyper-parameters and features."""
 
 
 class LowRankBatch:
@@ -125,14 +121,18 @@ class LowRankBatch:
             self.dataset = Dataset.from_rollouts(window.rollouts, chunk_size=compute.chunk_size)
         self.size = len(self.dataset)
         read = list(compute.map(ChunkRewards(self.task), self.dataset.chunks))
-        self.all_rewards, self.reward_unit = standardise(
-            np.concatenate([rewards for rewards, _ in read])
+        self.terminated = np.concatenate([terminated for _, terminated, _ in read])
+        self.all_rewards, self.reward_unit, self.end = standardise_with_end(
+            np.concatenate([rewards for rewards, _, _ in read]),
+            self.terminated,
+            settings.restart_probability,
         )
         self.in_memory = uniform_subsample(self.size, rng, low_rank.subsample)
+        self.all_in_memory = len(self.in_memory) == self.size
         self.data = self.dataset.take(self.in_memory)
         self.rewards = self.all_rewards[self.in_memory]
         if isinstance(samples, Dataset):
-            self.seen = sum(rollouts for _, rollouts in read), self.size
+            self.seen = sum(rollouts for _, _, rollouts in read), self.size
             self.actions = self.data.actions
         else:
             self.seen = len(samples), sum(map(len, samples))
@@ -147,10 +147,12 @@ class LowRankBatch:
             kernel = with_wrap_discontinuity(kernel, data, self.task, value)
             basis = self._centres(kernel, data.points, value.max_rank, value.tolerance)
         sums = reduce(add, self.compute.map(StartFeatures(basis, to_device), self.dataset.chunks))
-        state_features = StateFeatures(basis, sums[:-1] / int(sums[-1]), to_device)
-        own, observed = replace(state_features, to_device=as_float).observed(data)
+        starts = sums[:-1] / int(sums[-1])
+        own, observed = StateFeatures(basis, starts, as_float).observed(data)
+        restart = restart_features(starts, own.mean(axis=0), self.settings.exploring_starts)
         self.clock.lap("basis")
-        return StreamedFeatures(basis, own, observed, state_features.start, state_features)
+        streamed = StateFeatures(basis, restart, to_device)
+        return StreamedFeatures(basis, own, observed, restart, streamed)
 
     def transition_model(
         self,
@@ -176,20 +178,34 @@ class LowRankBatch:
         """Features of V at the successor that a regression of the state's change predicts."""
         data, task, state_features = self.data, self.task, features.state_features
         targets = DeltaStateTargets.fit(data, task)
-        model, errors, x = self._regressed(
+        model, errors, x, _ = self._regressed(
             targets.targets(data, task),
             lambda basis: DeltaStateSums(targets, basis, task, state_features.to_device),
             kernel,
             start,
             rng,
         )
-        dynamics = Dynamics(targets, model.mean, errors.errors)
+        centres = partial(self._centres, rank=self.low_rank.rank)
+        terminations = fit_terminations_in_features(data, kernel, rng, centres)
+        self.jitters += [] if terminations is None else [terminations.jitter]
+        dynamics = Dynamics(targets, model.mean, errors.errors, terminations)
         expected, errors = expected_features_of_samples(
-            data, features.basis, features.own, features.observed, features.start, dynamics, task
+            data, features.basis, features.own, features.observed, features.restart, dynamics, task
         )
-        for_actions = partial(dynamics.expected_features, features.basis, features.start)
-        successors = PredictedSuccessors(state_features, targets, model, task)
-        return StreamedExpectation(expected, errors, for_actions, x, dynamics, successors)
+        for_actions = partial(dynamics.expected_features, features.basis, features.restart)
+        successors = PredictedSuccessors(state_features, targets, model, task, terminations)
+        probabilities = self._termination_probabilities(dynamics)
+        return StreamedExpectation(
+            expected, errors, for_actions, x, dynamics, probabilities, None, successors
+        )
+
+    def _termination_probabilities(self, dynamics: Dynamics) -> FloatArray:
+        """Of all samples (n,), as the rows of the dual have them."""
+        model = dynamics.terminations
+        if model is None or self.all_in_memory:
+            return termination_probabilities_of_samples(self.data, dynamics)
+        of_chunk = ChunkTerminations(model, self.compute.to_device)
+        return np.concatenate(list(self.compute.map(of_chunk, self.dataset.chunks)))
 
     def _embedding(
         self,
@@ -199,28 +215,41 @@ class LowRankBatch:
         rng: np.random.Generator,
     ) -> StreamedExpectation:
         """Eq. 4 on the features of successors, as printed or less those of the state."""
-        data, task, own = self.data, self.task, features.own
-        state_features = features.state_features
-        terminated = data.terminated[:, None].astype(np.float64)
-        after = with_terminations(features.observed, terminated, features.start)
+        data, task, own, state_features = (
+            self.data,
+            self.task,
+            features.own,
+            features.state_features,
+        )
+        terminated, probabilities = targets_of(data), self.terminated.astype(np.float64)
+        after = with_terminations(features.observed, terminated, features.restart)
         if self.settings.model == "sample":
             successors = ObservedSuccessors(state_features)
-            return StreamedExpectation(after, None, None, None, None, successors)
+            return StreamedExpectation(
+                after, None, None, None, None, probabilities, None, successors
+            )
         relative = self.settings.model == "change"
         origin = embedding_origin(own, self.settings.model)
-        model, errors, x = self._regressed(
+        model, errors, x, basis = self._regressed(
             after - origin,
             lambda basis: EmbeddingSums(state_features, basis, task, relative),
             kernel,
             start,
             rng,
         )
+        inputs, terminations = state_actions(data, task), None
+        if terminated.any():  # regularised like the embedding of all samples
+            regulariser = float(np.exp(x[-1])) * len(data) / self.size
+            sums = RegressionSums.from_samples(basis.features(inputs), terminated)
+            terminations = as_probabilities(self._regression(basis, sums, regulariser).mean)
         return StreamedExpectation(
-            origin + model.mean(state_actions(data, task)),
+            origin + model.mean(inputs),
             errors,
             lambda rows, inputs: origin[rows] + model.mean(inputs),
             x,
             None,
+            probabilities,
+            terminations,
             EmbeddedSuccessors(state_features, model, task, relative),
         )
 
@@ -250,16 +279,13 @@ class LowRankBatch:
         errors = FeatureRegression.leave_one_out(
             basis.features(inputs), targets, regulariser, self.size / len(self.data)
         )
-        return self._regression(basis, sums, regulariser), errors, x
+        return self._regression(basis, sums, regulariser), errors, x, basis
 
     def solve_dual(
         self, features: StreamedFeatures, model: StreamedExpectation, eta_floor: float
-    ) -> tuple[StreamedProblem, DualSolution]:
-        settings, p = self.settings, self.settings.restart_probability
+    ) -> tuple[StreamedProblem, DualSolution, AbsorbingEnd | None]:
+        settings, restart, p = self.settings, features.restart, self.settings.restart_probability
         ridge = stationarity_ridge(settings, model.errors)
-        restart = restart_features(
-            features.start, features.own.mean(axis=0), settings.exploring_starts
-        )
         problem = StreamedProblem(
             dataset=self.dataset,
             rows=BellmanRows(model.successors, restart, p),
@@ -270,9 +296,16 @@ class LowRankBatch:
             compute=self.compute,
         )
         differences = feature_differences(features.own, model.expected, restart, p)
-        dual = coarse_to_fine(problem, ridge, differences, self.in_memory, self.low_rank.subsample)
+
+        def solve(problem: StreamedProblem, start: Start) -> DualSolution:
+            if start is not None and not self.all_in_memory:
+                return solve_dual(problem, start=start)
+            size = self.low_rank.subsample
+            return coarse_to_fine(problem, ridge, differences, self.in_memory, size, start)
+
+        problem, dual, end = solve_with_end(problem, model.terminations, self.end, solve=solve)
         self.clock.lap("dual")
-        return problem, dual
+        return problem, dual, end
 
     def fit_policy_to_data(
         self, p: FloatArray, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
@@ -314,9 +347,9 @@ class LowRankBatch:
 
     def fit_reward(
         self, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
-    ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]:
-        inputs = state_actions(self.data, self.task)
-        targets = (self.rewards - self.rewards.mean())[:, None]
+    ) -> tuple[RewardModel, FloatArray]:
+        all_inputs, rows = state_actions(self.data, self.task), regressed_steps(self.data)
+        inputs, targets = all_inputs[rows], (self.rewards - self.rewards.mean())[rows, None]
         kernel = with_wrap_discontinuity(kernel, self.data, self.task, self.settings.value)
         fitted, regulariser, x = embedding_hyperparameters(
             inputs, targets, kernel, self.task, start, rng
@@ -325,7 +358,7 @@ class LowRankBatch:
         sums = RegressionSums.from_samples(basis.features(inputs), targets)
         # scaled by the subsampling fraction, so that the subsample regularises like the full data
         model = self._regression(basis, sums, regulariser * len(self.data) / self.size)
-        return model.mean, x
+        return reward_model(model.mean, self.rewards, self.data, all_inputs), x
 
     def weights_in_memory(self, p: FloatArray) -> FloatArray:
         return p[self.in_memory] / p[self.in_memory].sum()

@@ -15,15 +15,14 @@ import numpy as np
 
 from kreps.algorithms.acceptance import proposal_std_scale, rejects
 from kreps.algorithms.dual import DualSolution
+from kreps.algorithms.ends import AbsorbingEnd, solve_with_end
 from kreps.algorithms.generated import GeneratedSamples, StateSource, generate, split_budget
-from kreps.algorithms.newton import solve_dual
 from kreps.algorithms.policy_targets import PolicyFit, PolicyTargets
 from kreps.algorithms.reps import Batch, Step, stationarity_ridge
 from kreps.algorithms.state import LearnerState
 from kreps.kernels.arrays import FloatArray
 from kreps.models.model_env import ModelEnv, supports_model_rollouts
 from kreps.models.novelty import novelty_bonus
-from kreps.models.transition import restart_features
 from kreps.models.world_model import WorldModel
 
 
@@ -67,12 +66,14 @@ class GeneratedStep:
     Attributes:
         samples: generated actions, with the problem of their weights.
         dual: its solution.
+        end: the state after a termination, with the average reward of the solution.
         targets: weighted means of these actions, and of those of the step before if they are kept.
         policy: fitted to the targets.
     """
 
     samples: GeneratedSamples
     dual: DualSolution
+    end: AbsorbingEnd | None
     targets: PolicyTargets
     policy: PolicyFit
 
@@ -146,14 +147,20 @@ def generated_step(
         rng,
     )
     # V changes little between the steps; but the temperature may have to rise, and starts at 1
-    dual = solve_dual(samples.problem, start=(1.0, before.dual.theta))
+    _, dual, end = solve_with_end(
+        samples.problem,
+        samples.terminations,
+        before.end,
+        samples.rewards,
+        start=(1.0, before.dual.theta),
+    )
     targets = PolicyTargets.from_generated(samples, dual.weights, batch.task)
     # Where not every rollout reached the goal, model rollouts may miss it too.  Then the targets
     # in replayed states are kept.
     if previous is not None and not batch.window.all_informative:
         targets = targets.concat(previous.targets)
     policy = batch.fit_policy(targets, step.kernel, before.policy.x, rng, std_scale)
-    return GeneratedStep(samples, dual, targets, policy)
+    return GeneratedStep(samples, dual, end, targets, policy)
 
 
 def world_model(
@@ -172,8 +179,9 @@ def world_model(
             restart_probability=settings.restart_probability,
             exploring_starts=settings.exploring_starts,
             max_steps=max(map(len, batch.window.rollouts)),
+            end_reward=0.0 if step.end is None else step.end.reward,
         )
-    reward_model, reward_start = batch.fit_reward(step.kernel, state.reward_start, rng)
+    rewards, reward_start = batch.fit_reward(step.kernel, state.reward_start, rng)
     weights = batch.weights_in_memory(step.dual.weights)
     assert step.model.for_actions is not None and settings.model_based is not None
     world = WorldModel(
@@ -181,12 +189,11 @@ def world_model(
         states=batch.data.states,
         features=features.own,
         phi=features.basis.features,
-        restart=restart_features(
-            features.start, features.own.mean(axis=0), settings.exploring_starts
-        ),
-        rewards=batch.rewards,
+        restart=features.restart,
         expected_features=step.model.for_actions,
-        reward_model=reward_model,
+        dynamics=step.model.dynamics,
+        terminations=step.model.terminations_for_actions,
+        reward_model=rewards,
         model_env=model_env,
         bonus=novelty_bonus(
             model_env,

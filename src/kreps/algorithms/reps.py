@@ -14,6 +14,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from kreps.algorithms.dual import DualSolution, Problem
+from kreps.algorithms.ends import AbsorbingEnd
 from kreps.algorithms.policy_targets import PolicyFit, PolicyTargets
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.data.rollouts import Transitions
@@ -24,6 +25,7 @@ from kreps.kernels.basis import Basis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.regression import LeaveOneOut
 from kreps.models.dynamics import Dynamics
+from kreps.models.reward_model import RewardModel
 from kreps.models.transition import state_kernel
 from kreps.settings import Settings
 
@@ -46,9 +48,9 @@ def reps_step(
     kernel = state_kernel(batch.data, batch.task, rng)
     features = batch.value_features(kernel)  # Eq. 3
     model = batch.transition_model(features, kernel, state.embedding_start, rng)  # Eq. 4
-    problem, dual = batch.solve_dual(features, model, eta_floor)  # Eqs. 2 and 5
+    problem, dual, end = batch.solve_dual(features, model, eta_floor)  # Eqs. 2 and 5
     policy = batch.fit_policy_to_data(dual.weights, kernel, state.policy_start, rng)  # Sec. 2
-    return Step(kernel, features, model, problem, dual, policy)
+    return Step(kernel, features, model, problem, dual, end, policy)
 
 
 @dataclass(frozen=True)
@@ -59,13 +61,14 @@ class ValueFeatures:
         basis: of V.
         own: (m, r) ``phi(s_i)``.
         observed: (m, r) ``phi(s'_i)``, whether or not the task ended there.
-        start: (r,) mean features of the start states.
+        restart: (r,) mean features of the states in which the process restarts; the same follows a
+            termination (`kreps.algorithms.ends`).
     """
 
     basis: Basis
     own: FloatArray
     observed: FloatArray
-    start: FloatArray
+    restart: FloatArray
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,10 @@ class Expectation:
             are taken in or nearest to, and inputs (k, ds + da); None without a learnt model.
         parameters: log hyper-parameters that the model was fitted with.
         dynamics: the fitted dynamics, if the model is ``"dynamics"``.
+        terminations: (n,) probabilities of a termination of all samples: as observed, or as the
+            dynamics predict it.
+        terminations_for_actions: the same (k,) of inputs (k, ds + da), where there are no dynamics;
+            None without terminations or without a learnt model.
     """
 
     expected: FloatArray
@@ -86,6 +93,8 @@ class Expectation:
     for_actions: Callable[[IntArray, FloatArray], FloatArray] | None
     parameters: FloatArray | None
     dynamics: Dynamics | None
+    terminations: FloatArray
+    terminations_for_actions: Callable[[FloatArray], FloatArray] | None
 
 
 @dataclass(frozen=True)
@@ -97,6 +106,7 @@ class Step:
     model: Expectation
     problem: Problem
     dual: DualSolution
+    end: AbsorbingEnd | None
     policy: PolicyFit
 
 
@@ -149,7 +159,9 @@ class Batch(Protocol[F, M]):
         """
         ...
 
-    def solve_dual(self, features: F, model: M, eta_floor: float) -> tuple[Problem, DualSolution]:
+    def solve_dual(
+        self, features: F, model: M, eta_floor: float
+    ) -> tuple[Problem, DualSolution, AbsorbingEnd | None]:
         """Eqs. 2 and 5: minimise the dual; its weights are of all n samples."""
         ...
 
@@ -172,8 +184,8 @@ class Batch(Protocol[F, M]):
 
     def fit_reward(
         self, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator
-    ) -> tuple[Callable[[FloatArray], FloatArray], FloatArray]:
-        """Expected reward (k, 1) less its mean, of inputs (k, ds + da); and its log parameters."""
+    ) -> tuple[RewardModel, FloatArray]:
+        """The reward model, and the log hyper-parameters that it was fitted with."""
         ...
 
     def weights_in_memory(self, p: FloatArray) -> FloatArray:

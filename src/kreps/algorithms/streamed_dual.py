@@ -107,6 +107,7 @@ def coarse_to_fine(
     differences: FloatArray,
     in_memory: IntArray,
     subsample_size: int,
+    start: tuple[float, FloatArray] | None = None,
 ) -> DualSolution:
     """The solution of the dual, with most Newton iterations on a part of the samples.
 
@@ -119,6 +120,7 @@ def coarse_to_fine(
         differences: (m, r) rows of B of the samples in memory.
         in_memory: (m,) numbers of these samples.
         subsample_size: largest number of samples in memory.
+        start: eta and theta to start from, if any.
     """
     n = len(problem.rewards)
     # each part has the ridge of the next larger one, for whose solution it is the start
@@ -129,7 +131,7 @@ def coarse_to_fine(
         ridge=ridge / min(GROWTH * len(in_memory), n),
         eta_floor=problem.eta_floor,
     )
-    dual = solve_dual(in_part)
+    dual = solve_dual(in_part, start=start)
     if len(in_memory) == n:
         return dual
     for stride in strides(n, subsample_size):

@@ -13,14 +13,16 @@ from typing import Protocol
 
 import numpy as np
 
+from kreps.algorithms.reps import Expectation, ValueFeatures
 from kreps.data.dataset import Chunk
 from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.errors import DataError
-from kreps.kernels.arrays import Array, FloatArray, as_numpy, like, namespace, rows
+from kreps.kernels.arrays import Array, BoolArray, FloatArray, as_numpy, like, rows
 from kreps.kernels.basis import Basis
 from kreps.kernels.regression import FeatureRegression, RegressionSums
 from kreps.models.dynamics import DeltaStateTargets, state_changes, with_terminations
+from kreps.models.terminations import Terminations
 from kreps.models.transition import state_actions
 from kreps.policies.sparse_gp import PolicySums
 
@@ -30,7 +32,7 @@ ToDevice = Callable[[FloatArray], Array]
 
 @dataclass(frozen=True)
 class ChunkRewards:
-    """Rewards (n,) of a chunk and its number of rollouts.
+    """Rewards (n,) and terminations (n,) of a chunk, and its number of rollouts.
 
     Raises:
         DataError: the widths of observations or actions are not those of the task.
@@ -38,7 +40,7 @@ class ChunkRewards:
 
     task: TaskSpec
 
-    def __call__(self, chunk: Chunk) -> tuple[FloatArray, int]:
+    def __call__(self, chunk: Chunk) -> tuple[FloatArray, BoolArray, int]:
         data = chunk.load().transitions
         found = data.points.shape[1], data.actions.shape[1]
         wanted = self.task.observation_size, self.task.action_size
@@ -48,7 +50,7 @@ class ChunkRewards:
                 f"action coordinates, but the task has {wanted[0]} and {wanted[1]}; "
                 "give rollouts of this task"
             )
-        return data.rewards, len(data.start)
+        return data.rewards, data.terminated, len(data.start)
 
 
 @dataclass(frozen=True)
@@ -70,12 +72,13 @@ class StateFeatures:
 
     Attributes:
         basis: of V.
-        start: (r,) mean features of the start states, which follow a termination.
+        restart: (r,) mean features of the states in which the process restarts, which follow a
+            termination.
         to_device: copies arrays to where features are computed.
     """
 
     basis: Basis
-    start: FloatArray
+    restart: FloatArray
     to_device: ToDevice
 
     def own(self, data: Transitions) -> Array:
@@ -88,10 +91,10 @@ class StateFeatures:
         return rows(points, data.state), rows(points, data.successor)
 
     def after_restarts(self, data: Transitions) -> tuple[Array, Array]:
-        """The same, with the start features in place of a successor in which the task ended."""
+        """The same, with the restart features in place of a successor in which the task ended."""
         own, after = self.observed(data)
         terminated = like(data.terminated[:, None].astype(np.float64), after)
-        return own, with_terminations(after, terminated, self.start)
+        return own, with_terminations(after, terminated, self.restart)
 
 
 @dataclass(frozen=True)
@@ -165,12 +168,26 @@ class ChunkPolicySums:
         return PolicySums.from_samples(z, like(weights[kept], z), like(targets, z))
 
 
+@dataclass(frozen=True)
+class StreamedFeatures(ValueFeatures):
+    """Features of V at the samples in memory, and the function that computes those of a chunk."""
+
+    state_features: StateFeatures
+
+
 class ExpectedSuccessors(Protocol):
     """A transition model: features of each state and expected features of its successor."""
 
     def __call__(self, data: Transitions) -> tuple[Array, Array]:
         """``phi(s_i)`` and ``E[phi(s') | s_i, a_i]``, (n, r) each."""
         ...
+
+
+@dataclass(frozen=True)
+class StreamedExpectation(Expectation):
+    """Predictions for the samples in memory, and the model that computes those of a chunk."""
+
+    successors: ExpectedSuccessors
 
 
 @dataclass(frozen=True)
@@ -221,15 +238,17 @@ class PredictedSuccessors:
         delta_targets: scale and linear mean of the targets.
         model: their fitted regression.
         task: limits and scale of the actions, and which coordinates are angles.
+        terminations: the termination model; None if no episode terminated.
     """
 
     state_features: StateFeatures
     delta_targets: DeltaStateTargets
     model: FeatureRegression
     task: TaskSpec
+    terminations: Terminations | None
 
     def __call__(self, data: Transitions) -> tuple[Array, Array]:
-        to_device, start = self.state_features.to_device, self.state_features.start
+        to_device, restart = self.state_features.to_device, self.state_features.restart
         own, observed = self.state_features.observed(data)
         inputs = to_device(state_actions(data, self.task))
         predictions = self.delta_targets.linear_mean(inputs) + self.model.mean(inputs)
@@ -237,8 +256,28 @@ class PredictedSuccessors:
         rest = to_device(data.states - state_changes(data, self.task))
         mirrored = 2.0 * self.delta_targets.changes(predictions) + rest
         averaged = 0.5 * (observed + self.state_features.basis.features(mirrored))
-        probabilities = namespace(predictions).clip(predictions[:, -1:], 0.0, 1.0)
-        return own, with_terminations(averaged, probabilities, start)
+        if self.terminations is not None:
+            successors = to_device(data.points[data.successor])
+            probabilities = self.terminations.probabilities(successors)[:, None]
+            averaged = with_terminations(averaged, probabilities, restart)
+        return own, averaged
+
+
+@dataclass(frozen=True)
+class ChunkTerminations:
+    """Probabilities (n,) that the steps of a chunk terminate, as predicted from the successors.
+
+    Attributes:
+        model: the termination model.
+        to_device: copies arrays to where features are computed.
+    """
+
+    model: Terminations
+    to_device: ToDevice
+
+    def __call__(self, chunk: Chunk) -> FloatArray:
+        data = chunk.load().transitions
+        return as_numpy(self.model.probabilities(self.to_device(data.points[data.successor])))
 
 
 @dataclass(frozen=True)

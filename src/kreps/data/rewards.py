@@ -19,8 +19,13 @@ def reward_depends_on_state(data: Rollout | Rollouts, task: TaskSpec) -> bool:
     Until some rollout reaches a sparse goal, the reward is a constant minus an action cost, and
     learning from it only teaches inaction.  It is detected by a least-squares fit of the rewards by
     a quadratic in the actions: the fit is exact, and no reward is above that of the zero action.
+
+    After a termination there is no reward.  So the reward depends on the state if any episode
+    terminated and any reward is not zero.
     """
     rewards = data.rewards
+    if np.any(data.terminated) and rewards.any():
+        return True
     tolerance = REWARD_RTOL * np.abs(rewards).max()
     if np.ptp(rewards) <= tolerance:
         return False

@@ -29,6 +29,7 @@ from kreps.kernels.arrays import Array, FloatArray, IntArray, columns, like
 from kreps.kernels.basis import Basis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.regression import PREDICTION_BATCH, LeaveOneOut
+from kreps.models.terminations import Terminations, fit_terminations
 from kreps.models.transition import fit_regression, state_actions
 
 CONSTANT_RTOL = 1e-12
@@ -59,7 +60,7 @@ def state_changes(data: Transitions, task: TaskSpec) -> FloatArray:
 
 @dataclass(frozen=True)
 class DeltaStateTargets:
-    """Targets of the regression: scaled changes of state less their linear mean; and terminations.
+    """Targets of the regression: scaled changes of state less their linear mean.
 
     Far from the data a kernel regression predicts zero, and it follows a slope only where samples
     are dense.  In mechanical systems most of the change is linear: a position changes with the
@@ -69,8 +70,8 @@ class DeltaStateTargets:
 
     Attributes:
         scale: (ds,) root mean square changes; coordinates that share a lengthscale share one.
-        coefficients: (1 + ds + da, ds + 1) of the linear mean: its constants, then the slopes in
-            states and actions.  Those of terminations, the last column, are zero.
+        coefficients: (1 + ds + da, ds) of the linear mean: its constants, then the slopes in states
+            and actions.
     """
 
     scale: FloatArray
@@ -87,23 +88,21 @@ class DeltaStateTargets:
             root_mean_square = np.sqrt(np.mean(squares[dims]))
             if root_mean_square > CONSTANT_RTOL * np.abs(data.points[:, dims]).max():
                 scale[dims] = root_mean_square
-        coefficients = linear_least_squares(state_actions(data, task), changes / scale, task)
-        return cls(scale, np.column_stack([coefficients, np.zeros(len(coefficients))]))
+        return cls(scale, linear_least_squares(state_actions(data, task), changes / scale, task))
 
     def targets(self, data: Transitions, task: TaskSpec) -> FloatArray:
-        """The targets (n, ds + 1) of n transitions."""
-        whole = np.column_stack([state_changes(data, task) / self.scale, data.terminated])
-        return whole - self.linear_mean(state_actions(data, task))
+        """The targets (n, ds) of n transitions."""
+        return state_changes(data, task) / self.scale - self.linear_mean(state_actions(data, task))
 
     def linear_mean(self, inputs: Array) -> Array:
-        """The linear mean (n, ds + 1) of states and scaled, applied actions (n, ds + da)."""
+        """The linear mean (n, ds) of states and scaled, applied actions (n, ds + da)."""
         used = np.flatnonzero(self.coefficients[1:].any(axis=1))  # few, if states are images
         slopes = self.coefficients[1:][used]
         return columns(inputs, used) @ like(slopes, inputs) + like(self.coefficients[0], inputs)
 
     def changes(self, predictions: Array) -> Array:
-        """Changes of state (n, ds), from targets plus linear mean (n, ds + 1)."""
-        return predictions[:, :-1] * like(self.scale, predictions)
+        """Changes of state (n, ds), from targets plus linear mean (n, ds)."""
+        return predictions * like(self.scale, predictions)
 
 
 def linear_least_squares(inputs: FloatArray, targets: FloatArray, task: TaskSpec) -> FloatArray:
@@ -134,15 +133,17 @@ def linear_least_squares(inputs: FloatArray, targets: FloatArray, task: TaskSpec
     return coefficients
 
 
-def with_terminations(features: Array, probabilities: Array, start: FloatArray) -> Array:
-    """Expected features of successors, if a start state follows a termination.
+def with_terminations(features: Array, probabilities: Array, restart: FloatArray) -> Array:
+    """Expected features of successors, if a restart follows a termination.
+
+    The steps without reward in between are accounted for in the reward (`kreps.algorithms.ends`).
 
     Args:
         features: (n, r) of the successors without a termination.
         probabilities: (n, 1) of a termination.
-        start: (r,) mean features of the start states.
+        restart: (r,) mean features of the states in which the process restarts.
     """
-    return features + probabilities * (like(start, features) - features)
+    return features + probabilities * (like(restart, features) - features)
 
 
 @dataclass(frozen=True)
@@ -151,14 +152,15 @@ class Dynamics:
 
     Attributes:
         delta_targets: scale and linear mean of the targets.
-        regression: predicts targets (m, ds + 1) from states and scaled, applied actions
-            (m, ds + da).
-        loo_residuals: (n, ds + 1) leave-one-out errors of the targets.
+        regression: predicts targets (m, ds) from states and scaled, applied actions (m, ds + da).
+        loo_residuals: (n, ds) leave-one-out errors of the targets.
+        terminations: the termination model; None if no episode terminated.
     """
 
     delta_targets: DeltaStateTargets
     regression: Callable[[FloatArray], FloatArray]
     loo_residuals: FloatArray
+    terminations: Terminations | None = None
 
     @cached_property
     def residuals(self) -> FloatArray:
@@ -166,15 +168,19 @@ class Dynamics:
         return self.delta_targets.changes(self.loo_residuals)
 
     def predict(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Mean successors (m, ds) and probabilities of termination (m, 1).
+        """Mean successors (m, ds) and probabilities of a termination there (m,).
 
         Args:
             inputs: (m, ds + da) states and scaled, applied actions.
         """
-        predictions = self.delta_targets.linear_mean(inputs) + self.regression(inputs)
-        states = inputs[:, : self.residuals.shape[1]]
-        successors = states + self.delta_targets.changes(predictions)
-        return successors, np.clip(predictions[:, -1:], 0.0, 1.0)
+        successors = self._mean_successors(inputs)
+        return successors, self.termination_probabilities(successors)
+
+    def termination_probabilities(self, successors: FloatArray) -> FloatArray:
+        """Probabilities (m,) that an episode ends in successors (m, ds)."""
+        if self.terminations is None:
+            return np.zeros(len(successors))
+        return self.terminations.probabilities(successors)
 
     def sample(
         self, rows: IntArray, inputs: FloatArray, residual_signs: FloatArray
@@ -188,29 +194,34 @@ class Dynamics:
             inputs: (m, ds + da) states and scaled, applied actions.
             residual_signs: (m, 1) one or minus one, drawn by the caller.
         """
-        successors, terminations = self.predict(inputs)
-        return successors + residual_signs * self.residuals[rows], terminations[:, 0]
+        successors = self._mean_successors(inputs) + residual_signs * self.residuals[rows]
+        return successors, self.termination_probabilities(successors)
+
+    def _mean_successors(self, inputs: FloatArray) -> FloatArray:
+        predictions = self.delta_targets.linear_mean(inputs) + self.regression(inputs)
+        return inputs[:, : self.residuals.shape[1]] + self.delta_targets.changes(predictions)
 
     def expected_features(
-        self, basis: Basis, start: FloatArray, rows: IntArray, inputs: FloatArray
+        self, basis: Basis, restart: FloatArray, rows: IntArray, inputs: FloatArray
     ) -> FloatArray:
         """``E[phi(s')]``, (m, r).
 
         Args:
             basis: of V.
-            start: (r,) mean features of the start states, which follow a termination.
+            restart: (r,) mean features of the states in which the process restarts, which follow a
+                termination.
             rows: (m,) samples whose states the actions are taken in or nearest to; the noise is
                 that of these samples.
             inputs: (m, ds + da) states and scaled, applied actions.
         """
-        expected = np.empty((len(rows), len(start)))
+        expected = np.empty((len(rows), len(restart)))
         for first in range(0, len(rows), PREDICTION_BATCH):
             batch = slice(first, first + PREDICTION_BATCH)
             successors, terminations = self.predict(inputs[batch])
             residuals = self.residuals[rows[batch]]
             averaged = 0.5 * basis.features(successors + residuals)
             averaged += 0.5 * basis.features(successors - residuals)
-            expected[batch] = with_terminations(averaged, terminations, start)
+            expected[batch] = with_terminations(averaged, terminations[:, None], restart)
         return expected
 
 
@@ -219,7 +230,7 @@ def expected_features_of_samples(
     basis: Basis,
     own: FloatArray,
     observed: FloatArray,
-    start: FloatArray,
+    restart: FloatArray,
     dynamics: Dynamics,
     task: TaskSpec,
 ) -> tuple[FloatArray, LeaveOneOut]:
@@ -230,7 +241,8 @@ def expected_features_of_samples(
         basis: of V.
         own: (n, r) features of each state.
         observed: (n, r) features of each successor, also where the task terminated.
-        start: (r,) mean features of the start states, which follow a termination.
+        restart: (r,) mean features of the states in which the process restarts, which follow a
+            termination.
         dynamics: of these transitions.
         task: which coordinates are angles.
 
@@ -239,13 +251,20 @@ def expected_features_of_samples(
         samples predict, relative to the features of the state.
     """
     terminated = data.terminated[:, None].astype(np.float64)
-    probabilities = np.clip(terminated - dynamics.loo_residuals[:, -1:], 0.0, 1.0)
+    probabilities = termination_probabilities_of_samples(data, dynamics)[:, None]
     predicted = data.states + state_changes(data, task) - dynamics.residuals
     averaged = 0.5 * (observed + basis.features(predicted - dynamics.residuals))
-    targets = with_terminations(observed, terminated, start)
-    predictions = with_terminations(basis.features(predicted), probabilities, start)
+    targets = with_terminations(observed, terminated, restart)
+    predictions = with_terminations(basis.features(predicted), probabilities, restart)
     errors = LeaveOneOut(targets - own, targets - predictions)
-    return with_terminations(averaged, probabilities, start), errors
+    return with_terminations(averaged, probabilities, restart), errors
+
+
+def termination_probabilities_of_samples(data: Transitions, dynamics: Dynamics) -> FloatArray:
+    """Probabilities (n,) that the steps terminate, as predicted from all other samples."""
+    if dynamics.terminations is None:
+        return np.zeros(len(data))
+    return np.clip(data.terminated - dynamics.terminations.loo_residuals, 0.0, 1.0)
 
 
 def fit_dynamics(
@@ -265,10 +284,13 @@ def fit_dynamics(
         rng: draws the samples of the fit.
 
     Returns:
-        The dynamics, the log hyper-parameters of the fit, and the jitter of the factorisation.
+        The dynamics, the log hyper-parameters of the fit, and the largest jitter.
     """
     delta_targets = DeltaStateTargets.fit(data, task)
     targets = delta_targets.targets(data, task)
     model, x = fit_regression(data, targets, state_kernel, task, start, rng)
     loo_residuals = model.leave_one_out(targets).errors
-    return Dynamics(delta_targets, model.predictor(targets), loo_residuals), x, model.factor.jitter
+    terminations = fit_terminations(data, state_kernel, rng)
+    dynamics = Dynamics(delta_targets, model.predictor(targets), loo_residuals, terminations)
+    jitter = max(model.factor.jitter, 0.0 if terminations is None else terminations.jitter)
+    return dynamics, x, jitter

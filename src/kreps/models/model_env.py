@@ -42,14 +42,14 @@ class ModelRollouts:
     """Rollouts of one policy in the model.
 
     Attributes:
-        rewards: (steps, count) expected, standardised.
+        rewards: (steps, count) expected, standardised; after a termination that of no reward.
         similarity: (steps, count) of each state to its nearest sample: the kernel's value, up to 1.
-        terminated: (steps, count) whether the episode ended, so that the next state is a start.
+        ended: (steps, count) whether the episode had terminated at an earlier step.
     """
 
     rewards: FloatArray
     similarity: FloatArray
-    terminated: BoolArray
+    ended: BoolArray
 
     def pessimistic_rewards(self, smallest: float, typical: float) -> FloatArray:
         """Rewards (steps, count), shrunk towards the smallest one where no sample is similar.
@@ -113,6 +113,7 @@ class ModelStep:
         similarity: (m,) to it.
         inputs: (m, ds + da) states and scaled, applied actions.
         successors: (m, ds) within the range of the data.
+        terminations: (m,) probabilities of a termination.
         terminated: (m,) whether the episode ended.
     """
 
@@ -120,6 +121,7 @@ class ModelStep:
     similarity: FloatArray
     inputs: FloatArray
     successors: FloatArray
+    terminations: FloatArray
     terminated: BoolArray
 
 
@@ -136,6 +138,7 @@ class ModelEnv:
         exploring_starts: share of the rollouts that begin in any sampled state, the others in
             start states.
         max_steps: largest number of steps of a rollout.
+        end_reward: reward zero, standardised: per step after a termination.
     """
 
     dynamics: Dynamics
@@ -145,6 +148,7 @@ class ModelEnv:
     restart_probability: float
     exploring_starts: float
     max_steps: int
+    end_reward: float
 
     def visited_states(
         self, policy: StochasticPolicy, count: int, rng: np.random.Generator
@@ -173,7 +177,7 @@ class ModelEnv:
     def evaluate(
         self,
         policies: Sequence[StochasticPolicy],
-        reward: Callable[[FloatArray], FloatArray],
+        reward: Callable[[FloatArray, FloatArray], FloatArray],
         count: int,
         rng: np.random.Generator,
     ) -> list[ModelRollouts]:
@@ -181,7 +185,8 @@ class ModelEnv:
 
         Args:
             policies: with their exploration noise.
-            reward: expected reward (m,) of states and scaled, applied actions (m, ds + da).
+            reward: expected reward (m,) of states and scaled, applied actions (m, ds + da), and of
+                probabilities of a termination (m,).
             count: rollouts per policy.
             rng: of starts and noise.
         """
@@ -192,22 +197,23 @@ class ModelEnv:
             parts = zip(policies, np.split(states, many), np.split(noise, many), strict=True)
             return np.concatenate([policy.act(*part) for policy, *part in parts])
 
-        inputs, similarity, terminated = [], [], []
+        inputs, similarity, terminations, ended = [], [], [], []
+        over = np.zeros(many * count, dtype=bool)
         states = np.tile(self._starts(count, rng), (many, 1))
         for _ in range(steps):
             noise = RolloutNoise.sample(count, self.task.action_size, rng).repeated(many)
             step = self._step(act, states, noise)
             inputs.append(step.inputs)
             similarity.append(step.similarity)
-            terminated.append(step.terminated)
+            terminations.append(step.terminations)
+            ended.append(over)
+            over = over | step.terminated
             states = step.successors
-            if step.terminated.any():
-                starts = np.tile(self._starts(count, rng), (many, 1))
-                states = np.where(step.terminated[:, None], starts, states)
-        rewards = reward(np.concatenate(inputs))
+        rewards = reward(np.concatenate(inputs), np.concatenate(terminations))
+        rewards = np.where(np.concatenate(ended), self.end_reward, rewards)
         each = (
             np.split(np.reshape(values, (steps, many * count)), many, axis=1)
-            for values in (rewards, similarity, terminated)
+            for values in (rewards, similarity, ended)
         )
         return [ModelRollouts(*parts) for parts in zip(*each, strict=True)]
 
@@ -246,9 +252,10 @@ class ModelEnv:
         nearest, similarity = self.nearest(states)
         actions = self.task.scaled_applied(act(states, noise.action_noise))
         inputs = np.concatenate([states, actions], axis=1)
-        successors, ends = self.dynamics.sample(nearest, inputs, noise.residual_signs)
+        successors, terminations = self.dynamics.sample(nearest, inputs, noise.residual_signs)
         successors = np.clip(successors, *self._range)
-        return ModelStep(nearest, similarity, inputs, successors, noise.end_uniforms < ends)
+        terminated = noise.end_uniforms < terminations
+        return ModelStep(nearest, similarity, inputs, successors, terminations, terminated)
 
     @cached_property
     def _samples(self) -> tuple[FloatArray, FloatArray]:

@@ -76,16 +76,15 @@ class NoveltyBonus:
     def optimistic_rewards(self, rollouts: ModelRollouts) -> FloatArray:
         """Rewards (steps, count) of model rollouts if unexplored regions are absorbing.
 
-        Novelty is in [0, 1], and so is the share of a rollout that has been absorbed.  The end of
-        an episode is followed by a start state, where nothing is absorbed.
+        Novelty is in [0, 1], and so is the share of a rollout that has been absorbed.  After a
+        termination nothing more is absorbed.
         """
         explored = np.ones(rollouts.rewards.shape[1])
         rewards = np.empty_like(rollouts.rewards)
         for t, novelty in enumerate(self.novelty(rollouts.similarity)):
-            explored = explored * (1.0 - novelty)
+            explored = explored * (1.0 - np.where(rollouts.ended[t], 0.0, novelty))
             optimistic = self.optimistic_reward
             rewards[t] = optimistic + explored * (rollouts.rewards[t] - optimistic)
-            explored[rollouts.terminated[t]] = 1.0
         return rewards
 
 

@@ -9,8 +9,10 @@ import numpy as np
 
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.models.dynamics import Dynamics
 from kreps.models.model_env import ModelEnv
 from kreps.models.novelty import NoveltyBonus
+from kreps.models.reward_model import RewardModel
 
 
 @dataclass(frozen=True)
@@ -23,10 +25,12 @@ class WorldModel:
         features: (n, r) of V there.
         phi: features (m, r) of V at any states (m, ds).
         restart: (r,) mean features of the states that the process restarts in.
-        rewards: (n,) observed, standardised.
         expected_features: ``E[phi(s')]`` (m, r) of sample numbers (m,), whose states the actions
             are taken in or nearest to, and of states and scaled, applied actions (m, ds + da).
-        reward_model: expected reward (m, 1), less the mean, of such states and actions.
+        dynamics: predicts successors; None if the transition model predicts features only.
+        terminations: in its place, probabilities (m,) of a termination of states and actions; None
+            if no episode terminated.
+        reward_model: expected rewards.
         model_env: rolls policies out in the model; None if the model cannot.
         bonus: exploration bonus; None if there is none.
     """
@@ -36,28 +40,28 @@ class WorldModel:
     features: FloatArray
     phi: Callable[[FloatArray], FloatArray]
     restart: FloatArray
-    rewards: FloatArray
     expected_features: Callable[[IntArray, FloatArray], FloatArray]
-    reward_model: Callable[[FloatArray], FloatArray]
+    dynamics: Dynamics | None
+    terminations: Callable[[FloatArray], FloatArray] | None
+    reward_model: RewardModel
     model_env: ModelEnv | None
     bonus: NoveltyBonus | None
 
-    def expected_rewards(self, inputs: FloatArray) -> FloatArray:
-        """Expected rewards (m,), standardised, of states and scaled, applied actions (m, ds + da).
+    def terminations_and_novelty(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Probabilities of a termination (m,), and novelty of the successors (m,) in [0, 1].
 
-        They are clipped to the range of the observed rewards, beyond which a regression may
-        overshoot.
+        After a termination there is no novelty.
+
+        Args:
+            inputs: (m, ds + da) states and scaled, applied actions.
         """
-        predicted = self.rewards.mean() + self.reward_model(inputs)[:, 0]
-        return np.clip(predicted, self.rewards.min(), self.rewards.max())
-
-    def novelty(self, inputs: FloatArray) -> FloatArray:
-        """Novelty (m,), in [0, 1], of the successors of states and actions (m, ds + da).
-
-        A start state, which follows the end of an episode, has none.
-        """
+        none = np.zeros(len(inputs))
+        if self.dynamics is None:
+            return none if self.terminations is None else self.terminations(inputs), none
+        if self.dynamics.terminations is None and self.bonus is None:
+            return none, none
+        successors, terminations = self.dynamics.predict(inputs)
         if self.model_env is None or self.bonus is None:
-            return np.zeros(len(inputs))
-        successors, ends = self.model_env.dynamics.predict(inputs)
+            return terminations, none
         _, similarity = self.model_env.nearest(successors)
-        return (1.0 - ends[:, 0]) * self.bonus.novelty(similarity)
+        return terminations, (1.0 - terminations) * self.bonus.novelty(similarity)

@@ -1,0 +1,79 @@
+"""The reward model: expected rewards of states and actions, and of terminations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from kreps.data.rollouts import Transitions
+from kreps.kernels.arrays import FloatArray, IntArray
+
+MIN_SHARE = 0.5
+"""Smallest share of steps without a termination at which these alone are regressed."""
+
+
+@dataclass(frozen=True)
+class RewardModel:
+    """Expected rewards, standardised.
+
+    The reward of the last step often jumps (a goal, a fall).  It is predicted as the reward of a
+    step without a termination plus a constant.
+
+    Attributes:
+        regression: rewards (m, 1) of inputs (m, ds + da), relative to ``mean``.
+        mean: of the rewards.
+        at_termination: what the reward of a terminating step exceeds the regression by, on average.
+        smallest, largest: observed rewards.  Predictions are clipped to them, as a regression may
+            overshoot.
+    """
+
+    regression: Callable[[FloatArray], FloatArray]
+    mean: float
+    at_termination: float
+    smallest: float
+    largest: float
+
+    def __call__(self, inputs: FloatArray, probabilities: FloatArray) -> FloatArray:
+        """Expected rewards (m,).
+
+        Args:
+            inputs: (m, ds + da) states and scaled, applied actions.
+            probabilities: (m,) of a termination.
+        """
+        predicted = self.mean + self.regression(inputs)[:, 0]
+        predicted = predicted + probabilities * self.at_termination
+        return np.clip(predicted, self.smallest, self.largest)
+
+
+def regressed_steps(data: Transitions) -> IntArray:
+    """Numbers of the steps whose rewards are regressed: those without a termination.
+
+    All steps, if most of them terminate.
+    """
+    going_on = np.flatnonzero(~data.terminated)
+    return going_on if len(going_on) >= MIN_SHARE * len(data) else np.arange(len(data))
+
+
+def reward_model(
+    regression: Callable[[FloatArray], FloatArray],
+    rewards: FloatArray,
+    data: Transitions,
+    inputs: FloatArray,
+) -> RewardModel:
+    """The reward model from its regression.
+
+    Args:
+        regression: of ``rewards - rewards.mean()``, fitted to `regressed_steps`.
+        rewards: (n,) standardised.
+        data: n transitions.
+        inputs: (n, ds + da) their states and scaled, applied actions.
+    """
+    mean = float(rewards.mean())
+    ended = np.flatnonzero(data.terminated)
+    at_termination = 0.0
+    if len(ended) and len(regressed_steps(data)) < len(data):
+        predicted = mean + regression(inputs[ended])[:, 0]
+        at_termination = float(np.mean(rewards[ended] - predicted))
+    return RewardModel(regression, mean, at_termination, float(rewards.min()), float(rewards.max()))
