@@ -373,6 +373,21 @@ def test_the_window_forgets_the_oldest_rollouts() -> None:
     )
 
 
+def test_a_window_with_too_few_steps_keeps_more_rollouts() -> None:
+    # two rollouts of 2 steps are fewer than the 5 steps wanted, and three are more
+    rollouts = [rollout(2, seed) for seed in range(6)]
+    window = ReplayWindow(task(), 2, 5)
+    for given in rollouts:
+        window = window.append([given])
+    assert [len(r) for r in window.rollouts] == [2, 2, 2]
+    np.testing.assert_array_equal(window.rollouts.points[-3:], rollouts[-1].observations)
+    # with longer ones the number of rollouts is the limit again
+    window = window.append([rollout(9, seed) for seed in range(2)])
+    assert [len(r) for r in window.rollouts] == [9, 9]
+    assert len(ReplayWindow(task(), 2).append(rollouts).rollouts) == 2
+    assert len(ReplayWindow(task(), None, 5).append(rollouts).rollouts) == 6
+
+
 def test_of_more_rollouts_than_the_window_holds_the_newest_are_kept() -> None:
     rollouts = [rollout(1 + i, i) for i in range(5)]
     assert [len(r) for r in ReplayWindow(task(), 2).append(iter(rollouts)).rollouts] == [4, 5]

@@ -25,7 +25,12 @@ from kreps.learning.learner import IterationReport
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.exploration import BangBang, Gaussian
 
-TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
+TINY: dict[str, Any] = {
+    "initial_rollouts": 6,
+    "rollouts_per_iteration": 3,
+    "window": 6,
+    "window_steps": 0,
+}
 STATES = np.stack([np.linspace(-1.5, 4.5, 7), np.linspace(-6.0, 6.0, 7)], axis=1)
 
 
@@ -637,7 +642,7 @@ def test_the_fraction_of_clipped_actions_is_of_the_new_rollouts() -> None:
 def test_rollouts_beyond_the_window_are_counted_but_not_kept() -> None:
     rng = np.random.default_rng(5)
     batch = [Rollout(rng.standard_normal((9, 2)), np.zeros((8, 1)), np.zeros(8)) for _ in "abc"]
-    learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]), window=2)
+    learner = kreps.KREPS(TaskSpec(2, [-1.0], [1.0]), window=2, window_steps=0)
     info = learner.update(batch)
     assert info.samples == 16
     assert (learner.state.rollouts, learner.state.steps) == (3, 24)

@@ -180,6 +180,12 @@ def test_old_rollouts_load(tmp_path: Path) -> None:
     assert len(kreps.rollout_folder(tmp_path)) == 2 * 38
 
 
+@pytest.mark.parametrize("name", CHECKPOINTS)
+def test_the_window_of_an_old_checkpoint_counts_rollouts_only(name: str) -> None:
+    learner = resume(name)
+    assert learner.settings.window_steps == learner.state.window.min_steps == 0
+
+
 def test_an_old_run_continues_as_before(tmp_path: Path) -> None:
     path = FOLDER / "run" / "checkpoint.safetensors"
     learner = kreps.KREPS.resume(path, gym.make("kreps/SwingUp-v0"))
@@ -362,7 +368,7 @@ OLD_DEFAULTS: dict[str, Any] = {
     "approximation": "auto",
     "rank": 1000,
 }
-"""All settings of REPS in version 0.1."""
+"""All settings of REPS in version 0.1.  Its windows had no smallest number of steps."""
 
 OLD_OBSERVED = {
     **OLD_DEFAULTS,
@@ -406,8 +412,8 @@ CHANGES: dict[str, list[Any]] = {
 
 @pytest.mark.parametrize("recipe", OLD_RECIPES)
 def test_a_whole_old_recipe_is_the_present_preset(recipe: str) -> None:
-    whole = changed(Settings(), present_settings(OLD_RECIPES[recipe]))
-    assert whole == settings_of(present_preset(recipe))
+    whole = changed(Settings(window_steps=0), present_settings(OLD_RECIPES[recipe]))
+    assert whole == settings_of(present_preset(recipe), window_steps=0)
 
 
 @pytest.mark.parametrize("recipe", OLD_RECIPES)
@@ -418,8 +424,10 @@ def test_changes_of_an_old_recipe_are_changes_of_the_preset(
     """As a checkpoint, with all settings, and as a run's config, with those that were changed."""
     for values in itertools.product(*(CHANGES[name] for name in names)):
         changes = dict(zip(names, values, strict=True))
-        whole = changed(Settings(), present_settings({**OLD_RECIPES[recipe], **changes}))
-        part = settings_of(present_preset(recipe), **present_settings(changes, recipe))
+        old = present_settings({**OLD_RECIPES[recipe], **changes})
+        whole = changed(Settings(window_steps=0), old)
+        new = present_settings(changes, recipe)
+        part = settings_of(present_preset(recipe), window_steps=0, **new)
         assert part == whole, changes
         assert settings_of(present_preset(recipe), **present_settings(flat(part), recipe)) == part
 
@@ -507,6 +515,7 @@ def test_the_first_checkpoints_keep_the_meaning_that_they_had() -> None:
         acceptance_rollouts=0,
         exploration_bonus=0.0,
     )
+    assert with_model.window_steps == 0  # their windows count rollouts only
     assert checkpoint_settings({"restarts": "stratified"}, "npalp") == {
         "rollout_lengths": "stratified"
     }

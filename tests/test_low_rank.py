@@ -546,7 +546,7 @@ def test_an_unlimited_window_keeps_everything(rollouts: list[Rollout]) -> None:
 
 
 def test_a_short_window_forgets_the_oldest(rollouts: list[Rollout]) -> None:
-    learner = kreps.KREPS(TASK, window=3, low_rank=LOW, value=LOW_VALUE)
+    learner = kreps.KREPS(TASK, window=3, window_steps=0, low_rank=LOW, value=LOW_VALUE)
     learner.update(rollouts[:3])
     assert learner.update(rollouts[3:5]).samples == sum(map(len, rollouts[2:5]))
     assert (learner.state.rollouts, learner.state.steps) == (5, sum(map(len, rollouts[:5])))

@@ -238,9 +238,9 @@ def test_the_page_has_the_settings_that_a_preset_changes(preset: str) -> None:
 def test_the_differences_of_the_default_and_the_preset_paper_are_listed() -> None:
     deviations = (ROOT / "docs/deviations.md").read_text()
     listed = deviations.split("## What the default preset changes")[1].split("\n## ")[0]
-    items = re.findall(r"^\d\. `(\w+) = ([^`]+)` instead of `([^`]+)`", listed, re.MULTILINE)
+    items = re.findall(r"^\d+\. `(\w+) = ([^`]+)` instead of `([^`]+)`", listed, re.MULTILINE)
     assert {name for name, *_ in items} == changed_fields("paper")
-    assert "in nine settings" in listed and len(items) == 9
+    assert "in ten settings" in listed and len(items) == 10
     names = vars(settings)
     for name, default, paper in items:
         assert getattr(Settings(), name) == eval(default, dict(names))

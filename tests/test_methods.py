@@ -31,6 +31,7 @@ ON_POLICY: dict[str, Any] = {
     "initial_rollouts": 12,
     "rollouts_per_iteration": 6,
     "window": 12,
+    "window_steps": 0,
 }
 ON_GRID: dict[str, Any] = {
     "restart_probability": P,

@@ -29,6 +29,7 @@ from kreps.settings import (
 MODEL_BASED: dict[str, Any] = {
     "restart_probability": 0.02,
     "window": 30,
+    "window_steps": 1000,
     "exploration.noise": "bang-bang",
     "exploration.scale": 1.0,
     "initial_rollouts": 30,
@@ -57,6 +58,7 @@ MODEL_BASED: dict[str, Any] = {
 SINGLE_STEP: dict[str, Any] = {
     **{name: v for name, v in MODEL_BASED.items() if not name.startswith("model_based.")},
     "model_based": None,
+    "window_steps": 0,
     "rollout_lengths": "independent",
     "eta_floor": 0.1,
     "ridge": 0.1,
@@ -87,7 +89,7 @@ def test_the_default_preset_is_the_defaults() -> None:
 
 
 def test_other_learners_have_these_defaults() -> None:
-    common = {name: MODEL_BASED[name] for name in ("restart_probability", "window")}
+    common = {name: SINGLE_STEP[name] for name in ("restart_probability", "window", "window_steps")}
     on_policy = {
         **common,
         "exploration.noise": "bang-bang",
@@ -311,6 +313,7 @@ NO_COUNTS = [0, -3, 2.5, 10.0, "10", None, True, np.float64(3)]
 OUT_OF_RANGE: dict[str, list[Any]] = {
     "restart_probability": [0.0, 1.0, -0.1, 1.5, *NOT_FINITE, *NO_NUMBERS],
     "window": [value for value in NO_COUNTS if value is not None],
+    "window_steps": [value for value in NO_COUNTS if value is not None and value != 0],
     "initial_rollouts": NO_COUNTS,
     "rollouts_per_iteration": NO_COUNTS,
     "rollout_lengths": ["both", "", None, 1, ["stratified"]],
@@ -356,6 +359,7 @@ def test_a_value_out_of_range_is_refused_by_name(name: str) -> None:
 TOO_FAR: dict[str, list[Any]] = {
     "restart_probability": [1e-300, 1e-12, 9e-10],
     "window": [10**15 + 1],
+    "window_steps": [10**15 + 1],
     "initial_rollouts": [100_001],
     "rollouts_per_iteration": [100_001],
     "kl_bound": [],

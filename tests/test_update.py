@@ -168,7 +168,7 @@ def test_clipped_includes_new_rollouts_that_the_window_does_not_keep(
 ) -> None:
     beyond = [replace(r, actions=np.sign(r.actions) * 9.0) for r in pushes(2, seed=1)]
     within = [replace(r, actions=0.1 * r.actions) for r in pushes(2)]
-    _, info = updated([*beyond, *within], low_rank=low_rank, window=2)
+    _, info = updated([*beyond, *within], low_rank=low_rank, window=2, window_steps=0)
     assert info.samples == 30
     assert 0.5 <= info.clipped < 0.6
 

@@ -104,7 +104,10 @@ ADDED_IN_0_1 = {
 
 def checkpoint_settings(stored: Mapping[str, Any], method: str) -> dict[str, Any]:
     """All settings of a checkpoint of version 0.1, in the flat form."""
-    return present_settings({**ADDED_IN_0_1, **stored} if method == "reps" else stored)
+    if method != "reps":
+        return present_settings(stored)
+    # windows of version 0.1 count rollouts only
+    return {**present_settings({**ADDED_IN_0_1, **stored}), "window_steps": 0}
 
 
 # ---- progress.csv -----------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from kreps.settings import (
 AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
 
 SINGLE_STEP = Settings(
+    window_steps=0,
     rollout_lengths="independent",
     eta_floor=0.1,
     ridge=0.1,

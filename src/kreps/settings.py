@@ -207,15 +207,20 @@ class LearnerSettings(Checked):
         restart_probability: p, with which the process restarts at each step, in [1e-9, 1).
         window: largest number of rollouts in the replay window, a third of them reserved for those
             with a state-dependent reward.  None keeps all.
+        window_steps: smallest number of steps in the window, for which more rollouts are kept than
+            ``window``: rollouts that terminate early have few.
     """
 
     restart_probability: float = 0.02
     window: int | None = 30
+    window_steps: int = 0
 
     def __post_init__(self) -> None:
         self._check(
             "restart_probability", Real, "at least 1e-9 and below 1", lambda v: 1e-9 <= v < 1
         )
+        whole = f"a whole number from 0 to {LARGEST}"
+        self._check("window_steps", Integral, whole, lambda v: 0 <= v <= LARGEST)
         if self.window is not None:
             whole = f"a whole number from 1 to {LARGEST}, or None to keep all"
             self._check("window", Integral, whole, lambda v: 1 <= v <= LARGEST)
@@ -283,6 +288,7 @@ class Settings(OnPolicySettings):
         model_based: `ModelBased`, or None: the paper's single step on the sampled actions.
     """
 
+    window_steps: int = 1_000
     rollout_lengths: RolloutLengths = "stratified"
     kl_bound: float = 1.0
     eta_floor: float | None = None

@@ -6,6 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
+import numpy as np
+
 from kreps.data.rewards import is_informative, is_long_enough, reward_depends_on_state
 from kreps.data.rollouts import NO_ROLLOUTS, Rollout, Rollouts, Transitions
 from kreps.data.task import TaskSpec
@@ -25,12 +27,14 @@ class ReplayWindow:
     Attributes:
         task: that the rollouts are of.
         capacity: largest number of rollouts; None keeps all.
+        min_steps: more rollouts are kept until they have so many steps.
         rollouts: those kept, oldest first.
         informative: of each, whether its reward depends on the state (`is_informative`).
     """
 
     task: TaskSpec
     capacity: int | None
+    min_steps: int = 0
     rollouts: Rollouts = NO_ROLLOUTS
     informative: tuple[bool, ...] = ()
 
@@ -44,23 +48,33 @@ class ReplayWindow:
         new.check(self.task)
         seen = [*self.rollouts, *new]
         informative = [*self.informative, *(is_informative(rollout, self.task) for rollout in new)]
-        kept = self._kept(informative)
+        kept = self._kept(informative, [len(rollout) for rollout in seen])
         return ReplayWindow(
             self.task,
             self.capacity,
+            self.min_steps,
             Rollouts.from_list([seen[i] for i in kept]),
             tuple(informative[i] for i in kept),
         )
 
-    def _kept(self, informative: list[bool]) -> list[int]:
-        """Numbers of the rollouts to keep, oldest first, given which of them are informative."""
+    def _kept(self, informative: list[bool], steps: list[int]) -> list[int]:
+        """Numbers of the rollouts to keep, oldest first.
+
+        Args:
+            informative: of each rollout, whether its reward depends on the state.
+            steps: of each rollout.
+        """
         numbers = list(range(len(informative)))
-        if self.capacity is None or len(numbers) <= self.capacity:
+        if self.capacity is None:
+            return numbers
+        needed = 1 + int(np.searchsorted(np.cumsum(steps[::-1]), self.min_steps))
+        capacity = max(self.capacity, needed)
+        if len(numbers) <= capacity:
             return numbers
         candidates = [i for i in numbers if informative[i]]
         reserved = candidates[len(candidates) - min(self._reserved, len(candidates)) :]
         others = sorted(set(numbers) - set(reserved))
-        return sorted(reserved + others[len(reserved) - self.capacity :])
+        return sorted(reserved + others[len(reserved) - capacity :])
 
     @property
     def _reserved(self) -> int:
@@ -72,7 +86,7 @@ class ReplayWindow:
         """The newest rollouts, as many as are not reserved."""
         if self.capacity is None:
             return self.rollouts
-        return self.rollouts[self._reserved - self.capacity :]
+        return self.rollouts[self._reserved - max(self.capacity, len(self.rollouts)) :]
 
     @cached_property
     def reward_depends_on_state(self) -> bool:

@@ -163,7 +163,9 @@ class Learner(Generic[MethodSettings]):
         if not isinstance(env, TaskSpec):
             self.env = environment_for(env, self.task, self.settings.restart_probability)
         self.threads = None if threads is None else max(1, _whole_number("threads", threads))
-        self.state = LearnerState(ReplayWindow(self.task, self.settings.window))
+        self.state = LearnerState(
+            ReplayWindow(self.task, self.settings.window, self.settings.window_steps)
+        )
         self._policy: Policy | None = None
 
     def _settings(self, changes: dict[str, Any]) -> MethodSettings:

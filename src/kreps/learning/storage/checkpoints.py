@@ -49,7 +49,7 @@ def _stored_window(window: ReplayWindow) -> Rollouts | None:
 
 
 def _window(stored: Rollouts | None, given: Mapping[str, Any]) -> ReplayWindow:
-    window = ReplayWindow(given["task"], given["capacity"])
+    window = ReplayWindow(given["task"], given["capacity"], given["min_steps"])
     return window if stored is None else window.append(stored)
 
 
@@ -151,7 +151,11 @@ def load_checkpoint(
         Whole(bits=128).check(header["seed"], "seed", {}, {})
         stored = header["state"]
         _check_presence(stored, method)
-        given = {"task": task, "capacity": settings.window}
+        given = {
+            "task": task,
+            "capacity": settings.window,
+            "min_steps": settings.window_steps,
+        }
         (state,) = arrays.decode([("", STATE, stored)], given, **_sizes(task, stored))
     warn_of(path, header, stacklevel=3)
     return state, task, settings, header["seed"]
