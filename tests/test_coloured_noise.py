@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kreps.policies.exploration import coloured_noise
+from kreps.policies.exploration import coloured_noise, noise_rows
 
 WHITE, PINK, RED = 0.0, 1.0, 2.0
 
@@ -49,3 +49,20 @@ def test_white_noise_is_the_generators_own() -> None:
 
 def test_a_rollout_of_one_step_has_finite_noise() -> None:
     assert np.isfinite(coloured_noise(PINK, 1, 2, np.random.default_rng(4))).all()
+
+
+@pytest.mark.parametrize("exponent", [WHITE, PINK, RED])
+def test_rows_of_noise_are_those_of_all_steps_at_once(exponent: float) -> None:
+    rows = noise_rows(exponent, 300, 2, np.random.default_rng(3))
+    wanted = coloured_noise(exponent, 300, 2, np.random.default_rng(3))
+    np.testing.assert_array_equal(np.array(list(rows)), wanted)
+
+
+@pytest.mark.parametrize("exponent", [WHITE, PINK, RED])
+def test_noise_of_a_rollout_without_end_is_drawn_as_it_is_needed(exponent: float) -> None:
+    rows = noise_rows(exponent, 10**18, 1, np.random.default_rng(3))
+    some = np.array([next(rows) for _ in range(70_000)])
+    assert np.isfinite(some).all()
+    white = noise_rows(WHITE, 70_000, 1, np.random.default_rng(3))
+    twin = np.random.default_rng(3).standard_normal((70_000, 1))
+    np.testing.assert_array_equal(np.array(list(white)), twin)

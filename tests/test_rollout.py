@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -17,7 +18,7 @@ from kreps.envs.restart import stratified_lengths
 from kreps.envs.swing_up import SwingUp
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
 from kreps.kernels.arrays import FloatArray
-from kreps.learning.collect import collect, simulate
+from kreps.learning.collect import collect, longest_rollout, simulate
 from kreps.learning.environment import batch_model_of, task_of
 from kreps.learning.evaluate import discounted_average
 from kreps.learning.wrappers import without_restarts
@@ -97,6 +98,19 @@ class InBatches(PointMass):
     def __init__(self, fault: str = "") -> None:
         super().__init__()
         self.batch_model = ThreeSteps(fault)
+
+
+class Endless(PointMass):
+    """A batch model whose task never ends."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.batch_model = Staying()
+
+
+class Staying(ThreeSteps):
+    def step(self, x: FloatArray, u: FloatArray, rngs: Any) -> Any:
+        return x, u[:, 0], np.zeros(len(x), bool)
 
 
 @dataclass(frozen=True)
@@ -284,6 +298,50 @@ def test_noise_is_drawn_for_as_many_steps_as_the_time_limit_allows() -> None:
     held = np.mean(rollout.actions[1:] == rollout.actions[:-1])
     # the lowest frequency of its noise is that of 200 steps, not of the 1e9 of the restarts
     assert held < 0.999
+
+
+@pytest.mark.parametrize("exploration", ["bang-bang", "pink"])
+@pytest.mark.parametrize("env", [EndsBeyond(PointMass(), 2.0), InBatches()], ids=["one", "batch"])
+def test_rollouts_that_only_the_environment_ends_need_no_memory_for_more(
+    env: gym.Env[Any, Any], exploration: str
+) -> None:
+    learner = kreps.KREPS(
+        env, seed=0, restart_probability=1e-9, exploration=exploration, initial_rollouts=6
+    )
+    tracemalloc.start()
+    learner.learn(1, progress=False)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 100 * 2**20
+    assert learner.state.window.rollouts.terminated.all()
+
+
+@pytest.mark.parametrize("env", [PointMass(), Endless()], ids=["one", "batch"])
+@pytest.mark.parametrize("probability", [1e-6, 1e-9])
+def test_rollouts_that_nothing_ends_are_an_error_with_the_remedy(
+    env: gym.Env[Any, Any], probability: float
+) -> None:
+    learner = kreps.KREPS(env, seed=0, restart_probability=probability, initial_rollouts=3)
+    with pytest.raises(ConfigurationError, match=r"more than 10000 steps.*TimeLimit"):
+        learner.learn(1, progress=False)
+    limited = gym.wrappers.TimeLimit(env, 20)
+    again = kreps.KREPS(limited, seed=0, restart_probability=probability, initial_rollouts=3)
+    assert again.learn(1, progress=False).state.steps == 60
+
+
+@pytest.mark.parametrize(
+    ("lengths", "longest"),
+    [
+        ([3, 50, 2], 50),
+        ([400] * 5_000, 400),
+        ([1_000_000] * 2, 1_000_000),  # 0.8 GiB
+        ([1_000_000] * 3, 10_000),
+        ([10**18], 10_000),
+        ([400] * 10_000, 248),
+    ],
+)
+def test_a_rollout_may_be_as_long_as_memory_allows(lengths: list[int], longest: int) -> None:
+    assert longest_rollout(lengths, TaskSpec(2, [-1.0], [1.0])) == longest
 
 
 def test_termination_in_a_batch_ends_that_rollout_only() -> None:

@@ -504,3 +504,10 @@ def test_ranges_of_a_grid_are_pairs_of_finite_numbers(ranges: Any) -> None:
     with pytest.raises(ConfigurationError, match=r"ranges = .*finite"):
         GridValueIterationSettings(ranges=ranges)
     assert GridValueIterationSettings(ranges=[[0, 1]]).ranges == ((0.0, 1.0),)  # type: ignore
+
+
+@pytest.mark.parametrize("kind", [ValueIterationSettings, GridValueIterationSettings])
+def test_there_are_at_most_as_many_candidate_actions_as_a_file_holds(kind: Any) -> None:
+    assert kind(actions=6000).actions == 6000
+    with pytest.raises(ConfigurationError, match=r"actions = 6001, .* from 1 to 6000"):
+        kind(actions=6001)

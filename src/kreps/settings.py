@@ -339,7 +339,7 @@ class ValueIterationSettings(OnPolicySettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._positive("temperature")
-        self._whole("actions", most=MOST)
+        self._whole("actions", most=6000)  # as many as the file of a policy may hold
 
 
 @dataclass(frozen=True)
@@ -368,7 +368,8 @@ class GridValueIterationSettings(LearnerSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._whole("actions", "grid_states", "grid_actions", most=MOST)
+        self._whole("grid_states", "grid_actions", most=MOST)
+        self._whole("actions", most=6000)
         if self.ranges is not None:
             try:
                 ranges = tuple((float(low), float(high)) for low, high in self.ranges)

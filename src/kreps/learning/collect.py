@@ -6,7 +6,8 @@ iteration, so that both ways give the same data from the same seed.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, cast
 
 import gymnasium as gym
@@ -18,7 +19,7 @@ from kreps.envs.batch import BatchModel, SettableModel
 from kreps.envs.restart import restart_length, stratified_lengths
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, NumericalError
 from kreps.intake import as_array, as_flag, as_flags, as_number, as_numbers
-from kreps.kernels.arrays import BoolArray, FloatArray, grid_points
+from kreps.kernels.arrays import BoolArray, FloatArray, IntArray, grid_points
 from kreps.learning.environment import (
     Environment,
     batch_model_of,
@@ -27,8 +28,18 @@ from kreps.learning.environment import (
     time_limit,
 )
 from kreps.policies.base import StochasticPolicy
-from kreps.policies.exploration import WHITE, coloured_noise
+from kreps.policies.exploration import WHITE, noise_rows
 from kreps.seeding import Purpose, generator, integer_seed
+
+MAX_BYTES = 2**30
+"""Largest size of a batch of rollouts while it is collected."""
+
+BYTES_PER_STEP = 400
+"""Size of a step beside its numbers."""
+
+MAX_EPISODE = 10_000
+"""Largest number of steps of a rollout in a batch that would be larger, and in which therefore only
+the environment can end a rollout."""
 
 
 def collect(
@@ -73,10 +84,23 @@ def collect(
         drawn = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
     lengths = [min(length, limit) for length in drawn]
     noises = [
-        coloured_noise(exponent, length, task.action_size, rng)
+        noise_rows(exponent, length, task.action_size, rng)
         for length, rng in zip(lengths, rngs, strict=True)
     ]
-    return simulate(env, task, policy, seeds, noises, on_rollout)
+    limit = longest_rollout(lengths, task)
+    return simulate(env, task, policy, seeds, noises, on_rollout, limit)
+
+
+def longest_rollout(lengths: Sequence[int], task: TaskSpec) -> int:
+    """Largest number of steps that a rollout may have, so that the batch fits in memory.
+
+    Args:
+        lengths: (R,) of the rollouts, unless the environment ends them before.
+        task: how wide a step is.
+    """
+    numbers = task.observation_size + task.action_size + 1
+    steps = MAX_BYTES // (8 * numbers + BYTES_PER_STEP)
+    return max(lengths) if sum(lengths) <= steps else min(MAX_EPISODE, steps // len(lengths))
 
 
 def collect_grid(
@@ -128,7 +152,7 @@ def collect_grid(
     rngs = [generator(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
     try:
         simulated = cast(SettableModel, model).states_at(states)
-        observations = _checked(model.observe(simulated), count, task).copy()
+        observations = _checked(model.observe(simulated), count, task)
         simulated, rewards, ended = _step(model, simulated, actions, rngs)
         successors = _checked(model.observe(simulated), count, task)
     except DataError:
@@ -169,8 +193,9 @@ def simulate(
     task: TaskSpec,
     policy: StochasticPolicy,
     seeds: Sequence[int],
-    noises: Sequence[FloatArray],
+    noises: Sequence[Iterable[FloatArray]],
     on_rollout: Callable[[int], None] | None = None,
+    longest: int = sys.maxsize,
 ) -> Rollouts:
     """One rollout per seed, as long as its noise unless the task ends before.
 
@@ -179,25 +204,38 @@ def simulate(
         task: of the environment.
         policy: that acts.
         seeds: (R,) of the environment.
-        noises: R arrays (length, da) of standard normal numbers for the policy.
+        noises: R times (length, da) standard normal numbers for the policy, in arrays or row by row
+            (`kreps.policies.exploration.noise_rows`).
         on_rollout: called with the number of rollouts that are complete.
+        longest: largest number of steps that a rollout may have (`longest_rollout`).
 
     Raises:
+        ConfigurationError: a rollout has more steps.
         EnvironmentFailure: the environment raised an exception.
         DataError: it returned NaN, infinities or observations of another size.
     """
     model = batch_model_of(env)
     if model is not None:
-        rollouts = _simulate_batch(model, task, policy, seeds, noises)
+        rollouts = _simulate_batch(model, task, policy, seeds, noises, longest)
         if on_rollout is not None:
             on_rollout(len(rollouts))
         return rollouts
     collected = []
     for number, (seed, noise) in enumerate(zip(seeds, noises, strict=True)):
-        collected.append(_simulate_one(env, task, policy, seed, noise, number))
+        collected.append(_simulate_one(env, task, policy, seed, noise, number, longest))
         if on_rollout is not None:
             on_rollout(number + 1)
     return Rollouts.from_list(collected)
+
+
+def _require_end(steps: int, longest: int) -> None:
+    """Raise `ConfigurationError` if a rollout has more steps than ``longest``."""
+    if steps > longest:
+        raise ConfigurationError(
+            f"a rollout has more than {longest} steps and goes on, but all of its batch must fit "
+            "in memory; raise restart_probability (a rollout has 1 / p steps on average), limit "
+            "the steps of the environment (gymnasium.wrappers.TimeLimit), or ask for fewer"
+        )
 
 
 def _simulate_batch(
@@ -205,46 +243,47 @@ def _simulate_batch(
     task: TaskSpec,
     policy: StochasticPolicy,
     seeds: Sequence[int],
-    noises: Sequence[FloatArray],
+    noises: Sequence[Iterable[FloatArray]],
+    longest: int,
 ) -> Rollouts:
     rngs = [gym.utils.seeding.np_random(seed)[0] for seed in seeds]
-    ends = np.array([len(noise) for noise in noises])  # lowered where the task ends before
-    terminated = np.zeros(len(ends), dtype=bool)
-    longest = int(ends.max())
-    observations = np.empty((longest + 1, len(ends), task.observation_size))
-    actions = np.empty((longest, len(ends), task.action_size))
-    rewards = np.empty((longest, len(ends)))
+    rows = [iter(noise) for noise in noises]
+    live = np.arange(len(rngs))
+    lengths, terminated = np.zeros(len(live), np.intp), np.zeros(len(live), dtype=bool)
+    steps: list[tuple[IntArray, FloatArray, FloatArray, FloatArray]] = []
     t = 0
     try:
-        states = np.array(model.initial(rngs))  # a copy, as rows are replaced below
-        observations[0] = _checked(model.observe(states), len(ends), task)
-        for t in range(longest):
-            live = np.flatnonzero(ends > t)
-            if len(live) == 0:
+        states = np.array(model.initial(rngs))
+        current = first = _checked(model.observe(states), len(live), task)
+        while len(live):
+            drawn = [next(rows[j], None) for j in live.tolist()]
+            going = np.array([noise is not None for noise in drawn])
+            live, states, current = live[going], states[going], current[going]
+            if not len(live):
                 break
-            noise = np.stack([noises[int(j)][t] for j in live])
-            actions[t, live] = policy.act(observations[t, live], noise)
-            applied = task.clip(actions[t, live])
-            states[live], rewards[t, live], done = _step(
-                model, states[live], applied, [rngs[int(j)] for j in live]
+            actions = policy.act(current, np.stack([noise for noise in drawn if noise is not None]))
+            states, rewards, done = _step(
+                model, states, task.clip(actions), [rngs[j] for j in live.tolist()]
             )
-            observations[t + 1, live] = _checked(model.observe(states[live]), len(live), task)
-            ends[live[done]] = t + 1
+            current = _checked(model.observe(states), len(live), task)
+            steps.append((live, actions, rewards, current))
+            t += 1
+            lengths[live] = t
             terminated[live[done]] = True
-    except (DataError, NumericalError):
+            _require_end(t, longest)
+            live, states, current = live[~done], states[~done], current[~done]
+    except (ConfigurationError, DataError, NumericalError):
         raise
     except Exception as error:
         raise _failure(error, "a batch of rollouts", t) from error
-    # steps that were not taken are left out of the padded arrays, one rollout after the other
-    numbers = np.arange(longest + 1)
-    taken, observed = numbers[:-1] < ends[:, None], numbers <= ends[:, None]
-    return Rollouts.from_arrays(
-        observations.swapaxes(0, 1)[observed],
-        actions.swapaxes(0, 1)[taken],
-        rewards.T[taken],
-        ends,
-        terminated,
+    rollout = np.concatenate([numbers for numbers, *_ in steps])
+    order = np.argsort(rollout, kind="stable")  # one rollout after the other
+    actions, rewards, successors = (
+        np.concatenate([step[part] for step in steps])[order] for part in (1, 2, 3)
     )
+    starts = np.cumsum(lengths) - lengths
+    points = np.insert(successors, starts, first, axis=0)
+    return Rollouts.from_arrays(points, actions, rewards, lengths, terminated)
 
 
 def _simulate_one(
@@ -252,30 +291,32 @@ def _simulate_one(
     task: TaskSpec,
     policy: StochasticPolicy,
     seed: int,
-    noise: FloatArray,
+    noise: Iterable[FloatArray],
     number: int,
+    longest: int,
 ) -> Rollout:
     spaces = spaces_of(env)
     observations: list[FloatArray] = []
     actions: list[FloatArray] = []
     rewards: list[float] = []
-    terminated = truncated = False
+    terminated = False
     try:
         observation, _ = env.reset(seed=seed)
         observations.append(_state(observation, task))
-        while not (terminated or truncated) and len(rewards) < len(noise):
-            state = observations[-1]
-            action = policy.act(state[None], noise[len(actions)][None])[0]
-            applied = spaces.actions(task.clip(action))
-            observation, reward, ended, cut, _ = env.step(applied)
+        for row in noise:
+            action = policy.act(observations[-1][None], row[None])[0]
+            observation, reward, ended, cut, _ = env.step(spaces.actions(task.clip(action)))
             observations.append(_state(observation, task))
             actions.append(action)
             rewards.append(as_number("reward", reward))
-            terminated, truncated = as_flag("terminated", ended), as_flag("truncated", cut)
+            _require_end(len(rewards), longest)
+            terminated = as_flag("terminated", ended)
+            if terminated or as_flag("truncated", cut):
+                break
     except DataError as error:
         where = f"rollout {number} of the environment, after {len(actions)} steps"
         raise DataError(f"{where}: {error}") from error
-    except NumericalError:
+    except (ConfigurationError, NumericalError):
         raise
     except Exception as error:
         raise _failure(error, f"rollout {number}", len(rewards)) from error
@@ -303,7 +344,7 @@ def _of_shape(name: str, values: Any, shape: tuple[int, ...]) -> FloatArray:
         raise DataError(
             f"the batch model returned {name} of shape {found.shape}, but {shape} is needed"
         )
-    return found
+    return np.array(found)  # a copy, as the model may use its arrays again
 
 
 def _step(

@@ -15,9 +15,10 @@ import numpy as np
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
-from kreps.learning.collect import simulate
+from kreps.learning.collect import longest_rollout, simulate
 from kreps.learning.wrappers import Environment, without_restarts
 from kreps.policies.base import LearntPolicy, StochasticPolicy
+from kreps.policies.exploration import WHITE, noise_rows
 from kreps.seeding import Purpose, generator, integer_seed
 
 EPISODES = 200
@@ -80,9 +81,12 @@ def evaluation_rollouts(
         policy,
         [integer_seed(seed, Purpose.EVALUATION_ENVIRONMENT, j) for j in range(episodes)],
         [
-            generator(seed, Purpose.EVALUATION_POLICY, j).standard_normal((steps, task.action_size))
+            noise_rows(
+                WHITE, steps, task.action_size, generator(seed, Purpose.EVALUATION_POLICY, j)
+            )
             for j in range(episodes)
         ],
+        longest=longest_rollout([steps] * episodes, task),
     )
 
 

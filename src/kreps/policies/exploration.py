@@ -8,6 +8,7 @@ noise, with beta = 2, is a random walk and moves the states farthest.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,9 @@ from kreps.kernels.arrays import FloatArray
 
 WHITE, PINK, RED = 0.0, 1.0, 2.0
 """Exponents beta of power spectra ``1 / f^beta``."""
+
+NOISE_BLOCK = 65_536
+"""Steps for which noise is drawn at once."""
 
 
 def coloured_noise(
@@ -43,6 +47,18 @@ def coloured_noise(
     spectrum = np.fft.rfft(rng.standard_normal((2 * length, width)), axis=0)
     noise = np.fft.irfft(amplitudes[:, None] * spectrum, n=2 * length, axis=0)
     return noise[:length] / np.sqrt(np.mean(both_sides**2))
+
+
+def noise_rows(
+    exponent: float, length: int, width: int, rng: np.random.Generator
+) -> Iterator[FloatArray]:
+    """The rows (width,) of `coloured_noise`, drawn when they are needed.
+
+    A rollout may end long before ``length`` steps.  Noise of more than `NOISE_BLOCK` steps is made
+    in independent blocks.
+    """
+    for first in range(0, length, NOISE_BLOCK):
+        yield from coloured_noise(exponent, min(length - first, NOISE_BLOCK), width, rng)
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from kreps.app.report import say_diagnosis
 from kreps.app.run_folder import RunFolder
 from kreps.learning.evaluate import EPISODES, STEPS
 from kreps.learning.methods import KREPS
+from kreps.settings import MOST
 
 EVALUATE_EXAMPLES = ("kreps evaluate runs/swing-up --episodes 200 --steps 400",)
 PLOT_EXAMPLES = ("kreps plot runs/swing-up",)
@@ -30,7 +31,7 @@ VIDEO_EXAMPLES = (
 
 def evaluate(
     run: RunArgument,
-    episodes: Annotated[int, typer.Option(min=2, help="Rollouts per policy.")] = EPISODES,
+    episodes: Annotated[int, typer.Option(min=2, max=MOST, help="Rollouts per policy.")] = EPISODES,
     steps: Annotated[int, typer.Option(min=1, help="Steps of each, without restarts.")] = STEPS,
     seed: Annotated[int, typer.Option(min=0, help="Of the evaluation.")] = 0,
 ) -> None:
