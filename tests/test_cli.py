@@ -520,6 +520,13 @@ def test_pictures_that_cannot_be_written_are_an_error_of_the_library(run: Path) 
     assert "video.gif" in rejected("video", run, "--steps", "2")
 
 
+def test_results_below_a_file_are_an_error_of_the_library(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    for figure in ("figure-1a", "figure-2a"):
+        text = rejected("reproduce", figure, "--trials", "1", "--out", tmp_path / "file" / "x")
+        assert "Not a directory" in text
+
+
 def test_an_environment_that_cannot_be_drawn_still_gets_its_report(tmp_path: Path) -> None:
     run = tmp_path / "run"
     options = ["--iterations", "1", "--out", run, *TINY]

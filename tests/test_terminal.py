@@ -137,6 +137,22 @@ def test_help_in_ascii() -> None:
     assert "+-" in text and "?" not in text
 
 
+@pytest.mark.parametrize("columns", [40, 60, 80])
+def test_help_shows_every_option_in_full_at_any_width(columns: int) -> None:
+    environment = {**os.environ, "COLUMNS": str(columns)}
+    for command, options in {
+        "train": ("--iterations", "--no-report", "--env-arg", "NAME=VALUE", "[default: 20"),
+        "export": ("--centres", "RUN_OR_POLICY"),
+        "reproduce": ("--scheduler", "ADDRESS", "kreps reproduce all"),
+    }.items():
+        done = subprocess.run(
+            [*KREPS, command, "--help"], capture_output=True, env=environment, check=True
+        )
+        text = done.stdout.decode()
+        assert "…" not in text
+        assert all(option in text for option in options), text
+
+
 def test_control_characters_of_an_unknown_environment_are_made_visible() -> None:
     command = [*KREPS, "train", "\x1b[2Jevil\x1b]0;owned\x07-v0", "--out", "run"]
     done = subprocess.run(command, capture_output=True, text=True)

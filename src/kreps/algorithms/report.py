@@ -72,7 +72,7 @@ class UpdateInfo:
     def shown(self) -> dict[str, str]:
         """The columns of a progress display."""
         return {
-            "KL / bound": f"{self.dual.kl:.3f} / {self.kl_bound:g}",
+            "KL / bound": f"{self.dual.kl:.3g} / {self.kl_bound:g}",
             "eta": f"{self.dual.eta:.3g}",
             "ESS": f"{self.effective_samples:.0f}",
             "gap": f"{self.dual.gap:.0e}",

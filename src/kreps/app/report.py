@@ -107,7 +107,7 @@ def _say_summary(folder: RunFolder, learner: KREPS, evaluation: Mapping[str, Eva
     if rows:
         last = rows[-1]
         say(
-            f"Last update {Outcome[last['outcome']]} (KL {float(last['kl']):.3f} of at most "
+            f"Last update {Outcome[last['outcome']]} (KL {float(last['kl']):.3g} of at most "
             f"{float(last['kl_bound']):g} nats, duality gap {float(last['gap']):.0e})."
         )
 

@@ -14,6 +14,7 @@ import numpy as np
 from kreps.envs.image_swing_up import PIXELS
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.envs.swing_up import TIME_STEP
+from kreps.errors import StorageError
 from kreps.experiments.specs import METHODS, TASKS
 from kreps.experiments.tables import markdown
 from kreps.experiments.trials import commits_of
@@ -235,6 +236,9 @@ def draw_features(path: Path) -> Path:
 
     Args:
         path: of the picture; its folder is made if there is none.
+
+    Raises:
+        StorageError: the folder cannot be made, or the picture not written.
     """
     from kreps import plotting  # Matplotlib is slow to import
     from kreps.experiments import plots
@@ -245,7 +249,10 @@ def draw_features(path: Path) -> Path:
         task = task_of(env)
         (rollout,) = simulate(env, task, BangBang(task), seeds, noise)
     shown = np.arange(1, 41, 5)
-    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StorageError(f"cannot make the folder {path.parent}: {error}") from error
     figure = plots.image_features(
         rollout.observations[shown], [float(t * TIME_STEP) for t in shown], PIXELS
     )

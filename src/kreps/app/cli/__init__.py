@@ -16,6 +16,7 @@ import typer
 
 import kreps
 from kreps.app.cli.export import EXPORT_EXAMPLES, export
+from kreps.app.cli.help import Command
 from kreps.app.cli.inspect import (
     DIAGNOSE_EXAMPLES,
     EVALUATE_EXAMPLES,
@@ -54,7 +55,7 @@ def options(
 def _add(command: Callable[..., Any], examples: Sequence[str], more_help: str = "") -> None:
     lines = "\n\n".join(f"  {example}" for example in examples)
     text = f"{getdoc(command)}\n\n{more_help}"
-    app.command(help=text, epilog=f"Examples:\n\n{lines}")(command)
+    app.command(cls=Command, help=text, epilog=f"Examples:\n\n{lines}")(command)
 
 
 _add(train, TRAIN_EXAMPLES, settings_help())
