@@ -395,12 +395,23 @@ def test_of_more_rollouts_than_the_window_holds_the_newest_are_kept() -> None:
 
 def test_many_groups_of_angles_are_checked_quickly() -> None:
     many = 20_000
+    pairs = [[i, i + 1] for i in range(0, many, 2)]
     started = time.process_time()
-    task = TaskSpec(many, np.zeros(1), np.ones(1), range(many), [[i] for i in range(many)])
-    assert task.factor_count == len(task.state_factors) == many
+    with pytest.raises(ConfigurationError, match="lengthscales"):  # which is checked last
+        TaskSpec(many, np.zeros(1), np.ones(1), range(many), pairs)
     assert (
         time.process_time() - started < 2.0
     )  # comparing all pairs of groups takes tens of seconds
+
+
+def test_more_lengthscales_than_can_be_fitted_are_refused_with_the_remedy() -> None:
+    with pytest.raises(ConfigurationError, match=r"3001 lengthscales.*observation_groups"):
+        TaskSpec(3001, np.zeros(1), np.ones(1))
+    for spec in (
+        TaskSpec(3000, np.zeros(1), np.ones(1)),
+        TaskSpec(30_000, np.zeros(1), np.ones(1), groups=[range(27_001)]),
+    ):
+        assert spec.factor_count == 3000
 
 
 @pytest.mark.parametrize("limit", [1e101, 1.7e308, np.inf])

@@ -12,7 +12,7 @@ from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Kernel
-from kreps.models.dynamics import DeltaStateTargets, Dynamics, fit_dynamics
+from kreps.models.dynamics import DeltaStateTargets, Dynamics, LinearMean, fit_dynamics
 from kreps.models.model_env import ModelEnv, average_reward, supports_model_rollouts
 from kreps.models.terminations import Terminations
 from kreps.models.transition import state_kernel
@@ -71,11 +71,11 @@ def model_env(
     ``loo_residuals``.
     """
     data = Transitions.from_rollouts(turns())
-    coefficients = np.zeros((4, 2))
-    coefficients[3] = np.array([0.1, 0.02]) if step is None else step
+    slopes = np.atleast_2d([0.1, 0.02] if step is None else step)
+    mean = LinearMean(np.array([2]), slopes, np.zeros(2))  # of the action alone
     rows = np.arange(len(data))[:, None]
     dynamics = Dynamics(
-        DeltaStateTargets(np.ones(2), coefficients),
+        DeltaStateTargets(np.ones(2), mean),
         lambda inputs: np.zeros((len(inputs), 2)),
         loo_residuals * (rows + 1.0) + np.zeros(2),
         None if termination is None else always(termination, len(data)),

@@ -13,6 +13,10 @@ from kreps.intake import as_array, is_sane
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Factor, factors_of
 
+MAX_LENGTHSCALES = 3000
+"""Largest number of lengthscales: a fit holds the distances of 200 samples for each, which are 0.9
+GiB."""
+
 MAX_IMAGE_SIDE = 1024
 """Pixels per side of an image: smoothing costs their square in memory and their cube in time."""
 
@@ -72,6 +76,14 @@ class TaskSpec:
         self._check_groups()
         if self.image_shape is not None:
             self._check_images(self.image_shape)
+        if self.factor_count > MAX_LENGTHSCALES:
+            raise ConfigurationError(
+                f"the {self.observation_size} coordinates of an observation have "
+                f"{self.factor_count} lengthscales, but at most {MAX_LENGTHSCALES} can be fitted; "
+                "give the pixels of an image one, by groups and image_shape of a TaskSpec, or by "
+                'the metadata "observation_groups" and "observation_image_shape" of an '
+                "environment; or observe fewer coordinates"
+            )
 
     def _check_sizes(self) -> None:
         if self.observation_size < 1:

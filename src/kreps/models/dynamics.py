@@ -59,6 +59,25 @@ def state_changes(data: Transitions, task: TaskSpec) -> FloatArray:
 
 
 @dataclass(frozen=True)
+class LinearMean:
+    """A linear function of few columns of its inputs: images have thousands that it does not use.
+
+    Attributes:
+        used: (u,) the columns with a slope.
+        slopes: (u, k).
+        constants: (k,).
+    """
+
+    used: IntArray
+    slopes: FloatArray
+    constants: FloatArray
+
+    def __call__(self, inputs: Array) -> Array:
+        """Its values (n, k) at inputs (n, d)."""
+        return columns(inputs, self.used) @ like(self.slopes, inputs) + like(self.constants, inputs)
+
+
+@dataclass(frozen=True)
 class DeltaStateTargets:
     """Targets of the regression: scaled changes of state less their linear mean.
 
@@ -70,12 +89,11 @@ class DeltaStateTargets:
 
     Attributes:
         scale: (ds,) root mean square changes; coordinates that share a lengthscale share one.
-        coefficients: (1 + ds + da, ds) of the linear mean: its constants, then the slopes in states
-            and actions.
+        linear_mean: (n, ds) of states and scaled, applied actions (n, ds + da).
     """
 
     scale: FloatArray
-    coefficients: FloatArray
+    linear_mean: LinearMean
 
     @classmethod
     def fit(cls, data: Transitions, task: TaskSpec) -> DeltaStateTargets:
@@ -94,43 +112,37 @@ class DeltaStateTargets:
         """The targets (n, ds) of n transitions."""
         return state_changes(data, task) / self.scale - self.linear_mean(state_actions(data, task))
 
-    def linear_mean(self, inputs: Array) -> Array:
-        """The linear mean (n, ds) of states and scaled, applied actions (n, ds + da)."""
-        used = np.flatnonzero(self.coefficients[1:].any(axis=1))  # few, if states are images
-        slopes = self.coefficients[1:][used]
-        return columns(inputs, used) @ like(slopes, inputs) + like(self.coefficients[0], inputs)
-
     def changes(self, predictions: Array) -> Array:
         """Changes of state (n, ds), from targets plus linear mean (n, ds)."""
         return predictions * like(self.scale, predictions)
 
 
-def linear_least_squares(inputs: FloatArray, targets: FloatArray, task: TaskSpec) -> FloatArray:
-    """Ridge regression of targets (n, k) on inputs (n, d): constants and slopes (1 + d, k).
+def linear_least_squares(inputs: FloatArray, targets: FloatArray, task: TaskSpec) -> LinearMean:
+    """Ridge regression of targets (n, k) on inputs (n, d).
 
-    Slopes of angles and of constant inputs are zero.  All coefficients are zero with fewer than
-    `SAMPLES_PER_COEFFICIENT` samples for the constant and each of the other slopes.
+    Angles and constant inputs have no slope.  There are neither slopes nor constants with fewer
+    than `SAMPLES_PER_COEFFICIENT` samples for the constant and each of the slopes.
 
     Args:
         inputs: states and scaled, applied actions.
         targets: of the regression.
         task: which inputs are states, and which of these are angles.
     """
-    coefficients = np.zeros((1 + inputs.shape[1], targets.shape[1]))
+    width = targets.shape[1]
     scale = inputs.std(axis=0)
     used = scale > CONSTANT_RTOL * np.abs(inputs).max(axis=0)
     used[list(task.periodic)] = False
     if len(inputs) < SAMPLES_PER_COEFFICIENT * (1 + np.count_nonzero(used)):
-        return coefficients
+        return LinearMean(np.empty(0, np.intp), np.empty((0, width)), np.zeros(width))
     ridge = np.full(inputs.shape[1], STATE_RIDGE * len(inputs))
     scale[task.observation_size :], ridge[task.observation_size :] = 1.0, ACTION_RIDGE
     centre = inputs[:, used].mean(axis=0)
     z = (inputs[:, used] - centre) / scale[used]
     product = z.T @ (targets - targets.mean(axis=0))
     slopes = np.linalg.solve(z.T @ z + np.diag(ridge[used]), product) / scale[used, None]
-    coefficients[1:][used] = slopes
-    coefficients[0] = targets.mean(axis=0) - centre @ slopes
-    return coefficients
+    constants = targets.mean(axis=0) - centre @ slopes
+    sloped = slopes.any(axis=1)
+    return LinearMean(np.flatnonzero(used)[sloped], slopes[sloped], constants)
 
 
 def with_terminations(features: Array, probabilities: Array, restart: FloatArray) -> Array:
