@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeVar
 
-from kreps.kernels.arrays import Array, FloatArray, as_float
+from kreps.kernels.arrays import Array, FloatArray, as_float, default_errstate
 from kreps.kernels.threads import blas_threads
 
 Result = TypeVar("Result")
@@ -63,5 +63,5 @@ class Compute:
 
 
 def _on_one_thread(function: Callable[..., Result], *arguments: Any) -> Result:
-    with blas_threads(1):
+    with blas_threads(1), default_errstate():
         return function(*arguments)

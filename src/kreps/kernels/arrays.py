@@ -22,6 +22,15 @@ Array = Any
 """An array of float64 of any library that follows the array API standard."""
 
 
+def default_errstate() -> np.errstate:
+    """A context, or decorator, in which floating-point errors are handled as by default in NumPy.
+
+    Kernel values far from all samples underflow to zero.  That is no error, also for a caller who
+    looks for errors of their own by ``np.seterr(all="raise")``.
+    """
+    return np.errstate(all="warn", under="ignore")
+
+
 def as_float(values: Any) -> FloatArray:
     """``values`` as a float64 array; no copy if it is one already."""
     return np.asarray(values, dtype=np.float64)

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from kreps.errors import ConfigurationError
-from kreps.kernels.arrays import Array, FloatArray, like
+from kreps.kernels.arrays import Array, FloatArray, default_errstate, like
 from kreps.kernels.kernel import Factor, Kernel, Periodic
 from kreps.kernels.linalg import solve_lower, solve_lower_transposed
 from kreps.kernels.pivoted_cholesky import pivoted_gaussian_gram
@@ -63,6 +63,7 @@ class KernelExpansion:
     centres: FloatArray
     alpha: FloatArray
 
+    @default_errstate()
     def __call__(self, states: Array) -> Array:
         k = self.kernel.gram(like(self.centres, states), states)
         return k.T @ like(self.alpha, states)

@@ -19,7 +19,7 @@ from kreps.envs.batch import BatchModel, SettableModel
 from kreps.envs.restart import restart_length, stratified_lengths
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, NumericalError
 from kreps.intake import as_array, as_flag, as_flags, as_number, as_numbers
-from kreps.kernels.arrays import BoolArray, FloatArray, IntArray, grid_points
+from kreps.kernels.arrays import BoolArray, FloatArray, IntArray, default_errstate, grid_points
 from kreps.learning.environment import (
     Environment,
     batch_model_of,
@@ -257,11 +257,13 @@ def _simulate_batch(
         current = first = _checked(model.observe(states), len(live), task)
         while len(live):
             drawn = [next(rows[j], None) for j in live.tolist()]
-            going = np.array([noise is not None for noise in drawn])
+            going = np.array([row is not None for row in drawn])
             live, states, current = live[going], states[going], current[going]
             if not len(live):
                 break
-            actions = policy.act(current, np.stack([noise for noise in drawn if noise is not None]))
+            with default_errstate():
+                noise = np.stack([row for row in drawn if row is not None])
+                actions = policy.act(current, noise)
             states, rewards, done = _step(
                 model, states, task.clip(actions), [rngs[j] for j in live.tolist()]
             )
@@ -304,7 +306,8 @@ def _simulate_one(
         observation, _ = env.reset(seed=seed)
         observations.append(_state(observation, task))
         for row in noise:
-            action = policy.act(observations[-1][None], row[None])[0]
+            with default_errstate():  # the environment keeps the caller's
+                action = policy.act(observations[-1][None], row[None])[0]
             observation, reward, ended, cut, _ = env.step(spaces.actions(task.clip(action)))
             observations.append(_state(observation, task))
             actions.append(action)

@@ -14,7 +14,7 @@ import numpy as np
 
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
-from kreps.kernels.arrays import FloatArray
+from kreps.kernels.arrays import FloatArray, default_errstate
 from kreps.learning.collect import longest_rollout, simulate
 from kreps.learning.wrappers import Environment, without_restarts
 from kreps.policies.base import LearntPolicy, StochasticPolicy
@@ -90,6 +90,7 @@ def evaluation_rollouts(
     )
 
 
+@default_errstate()
 def discounted_average(rollouts: Sequence[Rollout], restart_probability: float) -> Evaluation:
     """The sum of all rewards weighted by ``gamma^t``, divided by the sum of all weights.
 

@@ -22,6 +22,7 @@ from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError, enough_memory, shown
+from kreps.kernels.arrays import default_errstate
 from kreps.kernels.threads import blas_threads
 from kreps.learning import storage
 from kreps.learning.collect import collect
@@ -287,6 +288,7 @@ class Learner(Generic[MethodSettings]):
             raise DataError("there is no new rollout to learn from; give at least one")
         return self._update(new)
 
+    @default_errstate()
     def _update(self, samples: Any) -> UpdateReport:
         rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
         with blas_threads(self.threads, exact=True), enough_memory("the update"):
@@ -370,6 +372,7 @@ class OnPolicyLearner(Learner[OnPolicy]):
         return self.settings.initial_rollouts if first else self.settings.rollouts_per_iteration
 
     @property
+    @default_errstate()
     def exploring(self) -> bool:
         window = self.state.window
         return len(window.rollouts) > 0 and not window.newest_depend_on_state

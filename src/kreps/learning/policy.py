@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from kreps.errors import ConfigurationError
 from kreps.intake import as_numbers
+from kreps.kernels.arrays import default_errstate
 from kreps.learning import storage
 from kreps.learning.storage.onnx import write_onnx
 from kreps.policies.base import LearntPolicy
@@ -34,6 +35,7 @@ class Policy:
         self.iteration = iteration
         self._noise = generator(seed, Purpose.PREDICT, iteration)
 
+    @default_errstate()
     def predict(
         self,
         observation: Any,
@@ -76,6 +78,7 @@ class Policy:
         """Write the policy to a file; read it with `kreps.load_policy`."""
         storage.save_policy(self.process, path)
 
+    @default_errstate()
     def compressed(self, centres: int) -> Policy:
         """A sparse approximation of this policy, which is smaller and predicts faster.
 
@@ -115,6 +118,7 @@ class Policy:
             )
         return self
 
+    @default_errstate()
     def export_onnx(self, path: str | Path, dtype: str = "float64") -> str:
         """Write an ONNX model of the policy without exploration, for controllers in any language.
 

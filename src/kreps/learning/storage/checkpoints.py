@@ -12,6 +12,7 @@ from kreps.data.rollouts import Rollouts
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.errors import DataError, StorageError
+from kreps.kernels.arrays import default_errstate
 from kreps.kernels.basis import KernelExpansion
 from kreps.kernels.threads import blas_threads
 from kreps.learning.storage.codec import (
@@ -138,7 +139,7 @@ def load_checkpoint(
     Raises:
         StorageError: the file is missing, damaged, foreign, or of another method.
     """
-    with reading(path, "checkpoint") as (arrays, header), blas_threads(1):
+    with reading(path, "checkpoint") as (arrays, header), blas_threads(1), default_errstate():
         if header.get("method") != method:
             raise StorageError(
                 f"it is of the method {header.get('method')!s:.40}, not {method}; resume it with "

@@ -12,7 +12,7 @@ import numpy as np
 from kreps.data.spaces import Spaces
 from kreps.data.task import TaskSpec
 from kreps.errors import StorageError
-from kreps.kernels.arrays import FloatArray
+from kreps.kernels.arrays import FloatArray, default_errstate
 from kreps.kernels.kernel import Kernel, WrapAngle, wrap_factors
 from kreps.kernels.threads import blas_threads
 from kreps.learning.storage.codec import (
@@ -205,7 +205,7 @@ def load_policy(path: str | Path) -> LearntPolicy:
         StorageError: the file is missing, damaged or foreign.
     """
     # with one thread, as in learning, so that the policy is the same to the last bit
-    with reading(path, "policy") as (arrays, header), blas_threads(1):
+    with reading(path, "policy") as (arrays, header), blas_threads(1), default_errstate():
         task = decode_task(header)
         policy: LearntPolicy
         nodes = [("policy", POLICY, header["policy"])]
