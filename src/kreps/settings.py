@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import inf
 from numbers import Integral, Real
-from typing import Any, ClassVar, Literal, get_args
+from typing import ClassVar, Literal
 
+from kreps.checks import MAX_COUNT, MAX_WHOLE_NUMBER, Checked
 from kreps.errors import ConfigurationError, shown
 
 TransitionModelName = Literal["dynamics", "change", "embedding", "sample"]
@@ -15,58 +15,6 @@ RolloutLengths = Literal["independent", "stratified"]
 PolicyFitName = Literal["map", "bounded"]
 AngleWrap = Literal["discontinuous", "continuous"]
 Noise = Literal["bang-bang", "gaussian", "pink"]
-
-
-MOST = 100_000
-"""Largest number of rollouts, grid points per coordinate or candidate actions: all are made."""
-
-LARGEST = 10**15
-"""Largest whole number elsewhere, where it only limits others."""
-
-
-class Checked:
-    """Checks of single fields, for the frozen dataclasses below.
-
-    Each raises `ConfigurationError` with the value and what it must be.
-    """
-
-    def _choose(self, name: str, kind: Any) -> None:
-        if getattr(self, name) not in get_args(kind):
-            raise ConfigurationError(
-                f"{name} = {shown(getattr(self, name))} is unknown; choose one of "
-                + ", ".join(repr(choice) for choice in get_args(kind))
-            )
-
-    def _positive(self, *names: str) -> None:
-        for name in names:
-            self._check(name, Real, "positive and finite", lambda v: 0 < v < inf)
-
-    def _whole(self, *names: str, most: int = LARGEST) -> None:
-        for name in names:
-            limit = f"a whole number from 1 to {most}"
-            self._check(name, Integral, limit, lambda v: 1 <= v <= most)
-
-    def _check(self, name: str, kind: type, limit: str, holds: Callable[[Any], bool]) -> None:
-        """Accept numbers of any type, NumPy's included, and store them as Python's."""
-        value = getattr(self, name)
-        is_number = isinstance(value, kind) and not isinstance(value, bool)
-        if is_number and kind is Real:
-            try:
-                value = float(value)
-            except OverflowError:  # a whole number that is too large for a float
-                value = inf
-        if not (is_number and holds(value)):
-            raise ConfigurationError(f"{name} = {shown(value)}, but it must be {limit}")
-        object.__setattr__(self, name, int(value) if kind is Integral else value)
-
-    def _section(self, name: str, *kinds: type) -> None:
-        value = getattr(self, name)
-        if not isinstance(value, kinds):
-            names = ["None" if k is type(None) else f"kreps.{k.__name__}(...)" for k in kinds]
-            raise ConfigurationError(
-                f"{name} = {shown(value)}, but it must be {' or '.join(names)}; "
-                f'to change one field, write {{"{name}.field": value}}'
-            )
 
 
 # ---- sections ---------------------------------------------------------------------------------
@@ -125,7 +73,7 @@ class Grid(Checked):
     size: int = 10
 
     def __post_init__(self) -> None:
-        self._whole("size", most=MOST)
+        self._whole("size", largest=MAX_COUNT)
 
 
 @dataclass(frozen=True)
@@ -151,7 +99,10 @@ class LowRank(Checked):
     def __post_init__(self) -> None:
         self._whole("rank", "subsample")
         self._check(
-            "above", Integral, f"a whole number from 0 to {LARGEST}", lambda v: 0 <= v <= LARGEST
+            "above",
+            Integral,
+            f"a whole number from 0 to {MAX_WHOLE_NUMBER}",
+            lambda v: 0 <= v <= MAX_WHOLE_NUMBER,
         )
 
 
@@ -186,12 +137,12 @@ class ModelBased(Checked):
     max_samples: int = 20_000
 
     def __post_init__(self) -> None:
-        self._whole("actions_per_state", "max_samples", most=10_000_000)
+        self._whole("actions_per_state", "max_samples", largest=10_000_000)
         self._check("proposal_std_scale", Real, "from 1 to 1000", lambda v: 1 <= v <= 1000)
         self._check("model_rollout_fraction", Real, "in [0, 1]", lambda v: 0 <= v <= 1)
-        none_or_some = f"0, or a whole number from 2 to {MOST}"
+        none_or_some = f"0, or a whole number from 2 to {MAX_COUNT}"
         self._check(
-            "acceptance_rollouts", Integral, none_or_some, lambda v: v == 0 or 2 <= v <= MOST
+            "acceptance_rollouts", Integral, none_or_some, lambda v: v == 0 or 2 <= v <= MAX_COUNT
         )
         self._check("exploration_bonus", Real, "finite and >= 0", lambda v: 0 <= v < inf)
 
@@ -219,11 +170,11 @@ class LearnerSettings(Checked):
         self._check(
             "restart_probability", Real, "at least 1e-9 and below 1", lambda v: 1e-9 <= v < 1
         )
-        whole = f"a whole number from 0 to {LARGEST}"
-        self._check("window_steps", Integral, whole, lambda v: 0 <= v <= LARGEST)
+        whole = f"a whole number from 0 to {MAX_WHOLE_NUMBER}"
+        self._check("window_steps", Integral, whole, lambda v: 0 <= v <= MAX_WHOLE_NUMBER)
         if self.window is not None:
-            whole = f"a whole number from 1 to {LARGEST}, or None to keep all"
-            self._check("window", Integral, whole, lambda v: 1 <= v <= LARGEST)
+            whole = f"a whole number from 1 to {MAX_WHOLE_NUMBER}, or None to keep all"
+            self._check("window", Integral, whole, lambda v: 1 <= v <= MAX_WHOLE_NUMBER)
 
 
 @dataclass(frozen=True)
@@ -253,7 +204,7 @@ class OnPolicySettings(LearnerSettings):
         super().__post_init__()
         self._section("exploration", Exploration)
         self._choose("rollout_lengths", RolloutLengths)
-        self._whole("initial_rollouts", "rollouts_per_iteration", most=MOST)
+        self._whole("initial_rollouts", "rollouts_per_iteration", largest=MAX_COUNT)
 
 
 @dataclass(frozen=True)
@@ -339,7 +290,7 @@ class ValueIterationSettings(OnPolicySettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         self._positive("temperature")
-        self._whole("actions", most=6000)  # as many as the file of a policy may hold
+        self._whole("actions", largest=6000)  # as many as the file of a policy may hold
 
 
 @dataclass(frozen=True)
@@ -368,8 +319,8 @@ class GridValueIterationSettings(LearnerSettings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._whole("grid_states", "grid_actions", most=MOST)
-        self._whole("actions", most=6000)
+        self._whole("grid_states", "grid_actions", largest=MAX_COUNT)
+        self._whole("actions", largest=6000)
         if self.ranges is not None:
             try:
                 ranges = tuple((float(low), float(high)) for low, high in self.ranges)

@@ -13,9 +13,9 @@ from kreps.app.evaluation import evaluate_run, say_evaluation, write_evaluation
 from kreps.app.pictures import draw_diagnosis, draw_run, film_run
 from kreps.app.report import say_diagnosis
 from kreps.app.run_folder import RunFolder
+from kreps.checks import MAX_COUNT
 from kreps.learning.evaluate import EPISODES, STEPS
 from kreps.learning.methods import KREPS
-from kreps.settings import MOST
 
 EVALUATE_EXAMPLES = ("kreps evaluate runs/swing-up --episodes 200 --steps 400",)
 PLOT_EXAMPLES = ("kreps plot runs/swing-up",)
@@ -31,7 +31,9 @@ VIDEO_EXAMPLES = (
 
 def evaluate(
     run: RunArgument,
-    episodes: Annotated[int, typer.Option(min=2, max=MOST, help="Rollouts per policy.")] = EPISODES,
+    episodes: Annotated[
+        int, typer.Option(min=2, max=MAX_COUNT, help="Rollouts per policy.")
+    ] = EPISODES,
     steps: Annotated[int, typer.Option(min=1, help="Steps of each, without restarts.")] = STEPS,
     seed: Annotated[int, typer.Option(min=0, help="Of the evaluation.")] = 0,
 ) -> None:
