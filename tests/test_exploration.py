@@ -229,3 +229,85 @@ def test_it_explores_again_while_only_a_reserved_rollout_reached_the_goal() -> N
     kept = [r for r in learner.state.window.rollouts if r.terminated]
     assert len(kept) == 1 and kept[0].rewards[-1] == 100.0
     assert learner.exploring
+
+
+# ---- what the data identify -------------------------------------------------------------------
+
+
+class Tuning(gym.Env[Any, Any]):
+    """Trials of one or a few steps in which the reward is a function of the action alone."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,))
+    action_space = gym.spaces.Box(-1.0, 1.0, (1,))
+
+    def __init__(self, reward: Any, steps: int, terminates: bool) -> None:
+        self.reward, self.steps, self.terminates = reward, steps, terminates
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.left = self.steps
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action: Any) -> Any:
+        self.left -= 1
+        end = self.left == 0
+        reward = float(self.reward(float(action[0])))
+        return (
+            np.zeros(1, np.float32),
+            reward,
+            end and self.terminates,
+            end and not self.terminates,
+            {},
+        )
+
+
+@pytest.mark.parametrize("terminates", [False, True])
+@pytest.mark.parametrize("steps", [1, 3])
+@pytest.mark.parametrize(
+    ("reward", "best"),
+    [
+        (lambda a: -((a - 0.7) ** 2), 0.7),
+        (lambda a: -((a - 0.1) ** 2), 0.1),
+        (lambda a: -abs(a + 0.3), -0.3),
+        (lambda a: np.exp(-((a - 0.2) ** 2) / 0.1), 0.2),
+    ],
+)
+def test_the_best_action_is_found_if_the_reward_is_of_the_action_alone(
+    reward: Any, best: float, steps: int, terminates: bool
+) -> None:
+    learner = kreps.KREPS(Tuning(reward, steps, terminates), seed=0).learn(20, progress=False)
+    assert not learner.exploring
+    action, _ = learner.predict(np.zeros(1), deterministic=True)
+    assert action[0] == pytest.approx(best, abs=0.05)
+
+
+@pytest.mark.parametrize("reward", [lambda a: -(a**2), lambda a: -1.0, lambda a: 0.0])
+def test_in_trials_of_one_step_there_is_no_goal_to_explore_for(reward: Any) -> None:
+    learner = kreps.KREPS(Tuning(reward, 1, False), seed=0).learn(2, progress=False)
+    assert not learner.exploring
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "reward", "depends"),
+    [
+        # two actions, whose rewards are those of many costs
+        (-1.0, 1.0, lambda a: -((a - 0.1) ** 2), True),
+        (-1.0, 2.0, lambda a: -0.1 * a**2, True),
+        # the zero action is one of the two
+        (0.0, 2.0, lambda a: -0.1 * a**2, False),
+        (0.0, 2.0, lambda a: 0.1 * a**2, True),
+        # equal rewards tell nothing
+        (-1.0, 1.0, lambda a: -0.1 * a**2, False),
+    ],
+)
+def test_a_cost_of_actions_must_be_identified(
+    low: float, high: float, reward: Any, depends: bool
+) -> None:
+    task = TaskSpec(1, np.array([low]), np.array([high]))
+    actions = np.random.default_rng(0).choice([low, high], 40)[:, None]
+    found = Rollout(np.zeros((41, 1)), actions, reward(actions[:, 0]))
+    assert reward_depends_on_state(found, task) == depends
+    # any third action determines it
+    more = np.append(actions, [[0.5 * (low + high)]], axis=0)
+    third = Rollout(np.zeros((42, 1)), more, -0.1 * more[:, 0] ** 2)
+    assert not reward_depends_on_state(third, task)
