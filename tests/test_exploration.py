@@ -217,7 +217,9 @@ def test_the_newest_are_as_many_as_are_not_reserved(capacity: int | None, count:
 
 
 def test_it_explores_again_while_only_a_reserved_rollout_reached_the_goal() -> None:
-    learner = kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **TINY | {"window": 6})
+    learner = kreps.KREPS(
+        gym.make("MountainCarContinuous-v0"), seed=1, **TINY | {"window": 6, "window_steps": 0}
+    )
     learner.learn(1, progress=False)
     seen = learner.state.window.rollouts[0]
     rewards = np.where(np.arange(len(seen)) == len(seen) - 1, 100.0, seen.rewards)

@@ -15,10 +15,14 @@ from rich.text import Text
 
 from kreps.terminal import Output, printable
 
-console = Console()
-
 MIN_WIDTH = 20
 """Narrower terminals are written to as if they were as wide as this."""
+
+
+def console() -> Console:
+    """Standard output as it is now: its width may have changed since the start of the program."""
+    output = Console()
+    return output if output.width > 0 else Console(width=MIN_WIDTH)
 
 
 def say(message: str, indent: int = 0) -> None:
@@ -30,32 +34,33 @@ def say(message: str, indent: int = 0) -> None:
         message: one or several lines.
         indent: spaces before the continuation of a line that is broken.
     """
-    _print(console, Text(_broken(console, message, indent)))
+    output = console()
+    _print(output, Text(_broken(output, message, indent)))
 
 
 def say_error(message: str) -> None:
     """Print the message of an error on standard error."""
-    console = Console(stderr=True)
-    text = Text(_broken(console, f"error: {message}"))
+    output = Console(stderr=True)
+    text = Text(_broken(output, f"error: {message}"))
     text.stylize("bold red", 0, len("error:"))
-    _print(console, text)
+    _print(output, text)
 
 
 def say_command(label: str, command: str) -> None:
     """Print a command or path, which is not broken, so that it can be copied from the terminal."""
-    _print(console, Text(printable(f"{label}{command}")))
+    _print(console(), Text(printable(f"{label}{command}")))
 
 
-def _print(console: Console, text: Text) -> None:
-    console.print(text, soft_wrap=True)
+def _print(output: Console, text: Text) -> None:
+    output.print(text, soft_wrap=True)
 
 
-def _broken(console: Console, message: str, indent: int = 0) -> str:
+def _broken(output: Console, message: str, indent: int = 0) -> str:
     text = printable(message)
-    if not console.is_terminal:
+    if not output.is_terminal:
         return text
     wrapper = textwrap.TextWrapper(
-        width=max(console.width, MIN_WIDTH),
+        width=max(output.width, MIN_WIDTH),
         subsequent_indent=" " * indent,
         break_long_words=False,
         break_on_hyphens=False,

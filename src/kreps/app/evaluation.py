@@ -41,7 +41,7 @@ def evaluate_run(
     """
     assert learner.env is not None and learner.state.policy is not None
     found = {}
-    with console.status("evaluating ..."), blas_threads(1):
+    with console().status("evaluating ..."), blas_threads(1):
         for name, policy in stochastic_and_greedy(learner.state.policy).items():
             rollouts = evaluation_rollouts(
                 learner.env, learner.task, policy, episodes=episodes, steps=steps, seed=seed
@@ -59,7 +59,7 @@ def say_evaluation(found: Mapping[str, Evaluation]) -> None:
         table.add_column(heading)
     for name, result in found.items():
         table.add_row(name, f"{result.mean:.5g}", f"{2 * result.standard_error:.2g}")
-    console.print(table)
+    console().print(table)
 
 
 def write_evaluation(

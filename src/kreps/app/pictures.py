@@ -46,7 +46,7 @@ def draw_run(folder: RunFolder, learner: KREPS) -> list[Path]:
     assert learner.env is not None
     rows, config = folder.recorded_rows(), folder.config()
     evaluation = folder.evaluation(learner.state.iteration)
-    with console.status("drawing ..."):
+    with console().status("drawing ..."):
         curve = learning_curve(rows, references_of(config), evaluation, config.environment)
         drawn = [plotting.save(curve, folder.path / "learning_curve.png")]
         labels = labels_of(learner.env, learner.task)
@@ -107,7 +107,7 @@ def film_run(
     if learner.env is not None:
         _require_pictures(learner.env)  # so that no other one is made in vain
     policy, task = Policy(learner.policy.process, seed), learner.task
-    with console.status("filming ..."):
+    with console().status("filming ..."):
         with environment_of(folder.config(), render_mode="rgb_array") as env:
             _require_pictures(env)
             inside = environment_for(env, task, learner.settings.restart_probability)

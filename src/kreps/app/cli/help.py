@@ -19,7 +19,7 @@ class Command(TyperCommand):
     """A command whose help is a list where the terminal is too narrow for tables."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        if console.width >= TABLE_WIDTH:
+        if console().width >= TABLE_WIDTH:
             super().format_help(ctx, formatter)
             return
         say(f"{self.get_usage(ctx)}\n\n{_plain(self.help)}\n")
