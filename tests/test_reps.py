@@ -426,7 +426,9 @@ def test_a_single_step_gives_a_usable_policy(preset: str) -> None:
     one = [Rollout(np.array([[0.0, 0.0], [0.1, 0.3]]), np.array([[1.0]]), np.array([-1.0]))]
     settings = settings_of(preset)
     state, info = run(one, settings)
-    np.testing.assert_array_equal(info.dual.weights, [1.0])  # no reward depends on the state
+    # one sample does not identify an action cost, so the model-based step generates others from it
+    samples = 4 if preset == "model_based" else 1
+    np.testing.assert_allclose(info.dual.weights, np.full(samples, 1.0 / samples), atol=1e-4)
     assert info.dual.outcome is Outcome.AT_FLOOR
     assert info.support == 1
     assert_usable(state)
