@@ -58,6 +58,8 @@ HEALTHY: dict[str, Any] = {
     "samples": 1000,
     "weighted": 1600,
     "rank": 180,
+    "support": 250,
+    "newton_iterations": 9,
     "rank_residual": 9e-7,
     "gap": 1e-8,
     "outcome": "BOUND_ACTIVE",

@@ -13,6 +13,7 @@ from kreps.learning.environment import opened
 from kreps.learning.wrappers import Environment, Wrapper, keeps_actions, keeps_observations
 from kreps.learning.wrappers import metadata_of as usable_metadata
 from kreps.settings import LearnerSettings
+from kreps.terminal import printable
 
 
 class Labels(NamedTuple):
@@ -38,18 +39,22 @@ def metadata_of(env: Environment) -> Mapping[str, Any]:
     return metadata if isinstance(metadata, Mapping) else {}
 
 
+def literal(text: str) -> str:
+    """Text that Matplotlib draws as it is: without control characters and without mathematics."""
+    return printable(text).replace("$", r"\$")
+
+
 def labels_of(env: Environment, task: TaskSpec) -> Labels:
     """Labels from the environment's metadata, or numbered ones where those are not usable.
 
-    They are not usable if a wrapper may change what they are about.  A dollar sign is escaped, as
-    Matplotlib would read mathematics between two of them.
+    They are not usable if a wrapper may change what they are about.
     """
 
     def labels(kind: str, count: int, keeps: Callable[[Wrapper], bool]) -> list[str]:
         given = usable_metadata(env, keeps)[0].get(f"{kind}_labels")
         if not isinstance(given, list | tuple) or len(given) != count:
             return [f"{kind} {i}" for i in range(count)]
-        return [str(label).replace("$", r"\$") for label in given]
+        return [literal(str(label)) for label in given]
 
     return Labels(
         labels("observation", task.observation_size, keeps_observations),

@@ -15,6 +15,7 @@ from kreps.app.environments import (
     Labels,
     environment_of,
     labels_of,
+    literal,
     metadata_of,
     references_of,
 )
@@ -47,7 +48,7 @@ def draw_run(folder: RunFolder, learner: KREPS) -> list[Path]:
     rows, config = folder.recorded_rows(), folder.config()
     evaluation = folder.evaluation(learner.state.iteration)
     with console().status("drawing ..."):
-        curve = learning_curve(rows, references_of(config), evaluation, config.environment)
+        curve = learning_curve(rows, references_of(config), evaluation, literal(config.environment))
         drawn = [plotting.save(curve, folder.path / "learning_curve.png")]
         labels = labels_of(learner.env, learner.task)
         drawn += _draw_trajectories(folder, learner, labels)
@@ -69,7 +70,7 @@ def _draw_trajectories(folder: RunFolder, learner: KREPS, labels: Labels) -> lis
     longest = float(rollouts.lengths.max())
     steps = ceil(min(SHOWN_LENGTHS / learner.settings.restart_probability, longest))
     predicted = predicted_states(learner, rollouts[0].observations[0], steps)
-    title = f"{folder.config().environment}, iteration {learner.state.iteration}"
+    title = f"{literal(folder.config().environment)}, iteration {learner.state.iteration}"
     figure = trajectories(rollouts, predicted, steps, learner.policy.process, labels, title)
     return [plotting.save(figure, folder.path / "trajectories.png")]
 
@@ -132,6 +133,6 @@ def draw_diagnosis(folder: RunFolder, findings: Sequence[Finding], path: Path) -
     from kreps.app import diagnosis_page
 
     config = folder.config()
-    title = f"{config.environment}, {folder.path}"
+    title = literal(f"{config.environment}, {folder.path}")
     page = diagnosis_page.page(folder.recorded_rows(), findings, references_of(config), title)
     return plotting.save(page, path)

@@ -13,10 +13,12 @@ import csv
 import io
 import math
 from collections.abc import Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 from kreps.algorithms.dual import Outcome
+from kreps.checks import MAX_WHOLE_NUMBER
 from kreps.errors import StorageError
 from kreps.learning.learner import IterationReport
 from kreps.learning.methods import KREPS
@@ -89,6 +91,25 @@ COLUMNS = (
     *ADDED_COLUMNS,
 )
 
+TINY, HUGE = 1e-100, 1e100
+COUNT, POSITIVE, NOT_NEGATIVE, SHARE = (1, MAX_WHOLE_NUMBER), (TINY, HUGE), (0, HUGE), (0, 1)
+
+WHOLE = {
+    **dict.fromkeys(("iteration", "rollouts", "steps", "samples", "support"), COUNT),
+    **dict.fromkeys(("rank", "weighted", "max_rank"), COUNT),
+    "newton_iterations": (0, MAX_WHOLE_NUMBER),
+}
+"""Smallest and largest value of columns of whole numbers."""
+
+RANGES = {
+    **WHOLE,
+    **dict.fromkeys(("kl_bound", "eta", "effective_samples", "ridge"), POSITIVE),
+    **dict.fromkeys(("jitter", "eta_floor", "policy_noise", "model_error"), NOT_NEGATIVE),
+    **dict.fromkeys(map(seconds_column, STAGES), NOT_NEGATIVE),
+    **dict.fromkeys(("clipped", "exploring", "rejected"), SHARE),
+}
+"""Smallest and largest value of columns whose numbers cannot be anything up to 1e100."""
+
 
 def read_progress(path: Path) -> list[dict[str, str]]:
     """The rows by column; empty if there is no such file.
@@ -103,7 +124,11 @@ def read_progress(path: Path) -> list[dict[str, str]]:
             reader = csv.reader(file)
             columns = present_columns(next(reader, []))
             _check_columns(columns)
-            return [_checked_row(columns, values) for values in reader if values]
+            rows = [_checked_row(columns, values) for values in reader if values]
+        numbers = [int(row["iteration"]) for row in rows]
+        if any(later <= earlier for earlier, later in pairwise(numbers)):
+            raise ValueError("its iterations do not ascend")
+        return rows
     except FileNotFoundError:
         return []
     except (OSError, ValueError, TypeError, csv.Error) as error:
@@ -124,10 +149,18 @@ def _checked_row(columns: Sequence[str], values: Sequence[str]) -> dict[str, str
     if row["outcome"] not in Outcome.__members__:
         raise ValueError(f"it has an unknown outcome {row['outcome']!r:.40}")
     for name in COLUMNS:
-        value = 0.0 if name == "outcome" else float(row[name])
-        if not (math.isfinite(value) or (name in ADDED_COLUMNS and math.isnan(value))):
-            raise ValueError("it holds NaN or infinities")
+        if name != "outcome":
+            _check_number(name, row[name])
     return row
+
+
+def _check_number(name: str, text: str) -> None:
+    if name in ADDED_COLUMNS and math.isnan(float(text)):
+        return
+    value = int(text) if name in WHOLE else float(text)
+    low, high = RANGES.get(name, (-HUGE, HUGE))
+    if not low <= value <= high:  # nor NaN
+        raise ValueError(f"{name} = {text:.40}, but it must be between {low:g} and {high:g}")
 
 
 def progress_text(rows: Sequence[Mapping[str, Any]]) -> str:

@@ -9,17 +9,20 @@ are ahead of it are dropped on resuming.
 from __future__ import annotations
 
 import json
-import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from kreps.app.lock import locked
 from kreps.app.progress_file import progress_row, progress_text, read_progress
 from kreps.data.rollouts import Rollouts
 from kreps.errors import ConfigurationError, StorageError
+from kreps.intake import MAX_MAGNITUDE
 from kreps.learning.learner import IterationReport
 from kreps.learning.methods import KREPS
-from kreps.learning.storage import load_rollouts, save_policy, write_atomically
+from kreps.learning.storage import load_rollouts, remove_parts, save_policy, write_atomically
 from kreps.legacy import present_preset, present_settings
 from kreps.versions import versions
 
@@ -58,6 +61,29 @@ class RunFolder:
         self.evaluation_file = self.path / "evaluation.json"
         self.rollouts_file = self.path / "evaluation_rollouts.safetensors"
 
+    def make(self) -> None:
+        """Make the folder, unless it is there.
+
+        Raises:
+            StorageError: it cannot be made.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise StorageError(f"cannot make the folder {self.path}: {error}") from error
+
+    @contextmanager
+    def learning(self) -> Iterator[None]:
+        """Let no other process learn in the folder as long as the block lasts.
+
+        Raises:
+            StorageError: another process learns in it, or nothing can be written in it.
+        """
+        with locked(self.path / ".lock"):
+            for file in (self.progress_file, self.policy_file, self.checkpoint_file):
+                remove_parts(file)
+            yield
+
     def create(self, config: RunConfig) -> None:
         """Start a run here.
 
@@ -65,15 +91,12 @@ class RunFolder:
             ConfigurationError: the folder holds a run already.
             StorageError: the folder cannot be made.
         """
+        self.make()
         if self.config_file.exists():
             raise ConfigurationError(
                 f"{self.path} holds a run already; continue it with `kreps resume {self.path}`, "
                 "remove it, or choose another folder"
             )
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise StorageError(f"cannot make the folder {self.path}: {error}") from error
         self.write_config(config)
 
     def write_config(self, config: RunConfig) -> None:
@@ -95,11 +118,14 @@ class RunFolder:
                 content["settings"] = present_settings(content["settings"], recipe)
                 content["preset"] = present_preset(recipe)
             config = RunConfig(**content)
-            types = {"environment": str, "iterations": int, "seed": int}
-            types |= {"settings": dict, "arguments": dict}
+            types = {"environment": str, "preset": str, "settings": dict, "arguments": dict}
             for name, kind in types.items():
                 if not isinstance(getattr(config, name), kind):
                     raise TypeError(f"{name} is not a {kind.__name__}")
+            for name, bits in (("iterations", 63), ("seed", 128)):
+                value = getattr(config, name)
+                if type(value) is not int or not 0 <= value < 2**bits:
+                    raise TypeError(f"{name} is not a whole number of at most {bits} bits")
             if not isinstance(config.periodic, list | None):
                 raise TypeError("periodic is not a list")
         except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -127,21 +153,21 @@ class RunFolder:
             )
         return rows
 
-    def evaluation(self, iteration: int) -> dict[str, Any] | None:
-        """The content of ``evaluation.json``; None if there is none of the policy of an iteration.
+    def evaluation(self, iteration: int) -> dict[str, dict[str, float]] | None:
+        """Mean and standard error of the stochastic and the greedy policy of an iteration.
+
+        They are those of ``evaluation.json``; None if it is missing or of another iteration.
 
         Raises:
             StorageError: it is not what an evaluation writes.
         """
         try:
             content = json.loads(self.evaluation_file.read_text())
-            for name in ("stochastic", "greedy"):
-                if not math.isfinite(content[name]["mean"]):
-                    raise ValueError("it holds NaN or infinities")
-            return content if content["iteration"] == iteration else None
+            found = {name: _evaluated(content[name]) for name in ("stochastic", "greedy")}
+            return found if content["iteration"] == iteration else None
         except FileNotFoundError:
             return None
-        except (OSError, ValueError, TypeError, KeyError, RecursionError) as error:
+        except (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError) as error:
             raise StorageError(
                 f"{self.evaluation_file} is damaged ({error}); remove it, or evaluate again"
             ) from error
@@ -177,3 +203,18 @@ class RunFolder:
         assert learner.state.policy is not None
         save_policy(learner.state.policy, self.policy_file)
         learner.save(self.checkpoint_file)
+
+
+def _evaluated(content: Any) -> dict[str, float]:
+    """Mean and standard error of one policy; that of earlier versions is 0.
+
+    Raises:
+        ValueError, TypeError, OverflowError, KeyError: these are no finite numbers.
+    """
+    found = {"mean": content["mean"], "standard_error": content.get("standard_error", 0.0)}
+    for name, value in found.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise TypeError(f"{name} is {value!r:.40}, no number")
+        if not abs(float(value)) <= MAX_MAGNITUDE:
+            raise ValueError(f"{name} is {value:g}, no number up to {MAX_MAGNITUDE:g}")
+    return {name: float(value) for name, value in found.items()}

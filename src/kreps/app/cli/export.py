@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from kreps.app.cli.paths import PATH
 from kreps.app.console import say
 from kreps.app.run_folder import RunFolder
 from kreps.errors import ConfigurationError
@@ -31,13 +33,14 @@ def export(
     source: Annotated[
         Path,
         typer.Argument(
-            metavar="RUN_OR_POLICY",
             help="Folder of the run, or a policy's .safetensors file.",
             show_default=False,
+            **{**PATH, "metavar": "RUN_OR_POLICY"},
         ),
     ],
     out: Annotated[
-        Path, typer.Option(help="An .onnx file, or a .safetensors file for kreps.load_policy.")
+        Path,
+        typer.Option(help="An .onnx file, or a .safetensors file for kreps.load_policy.", **PATH),
     ],
     centres: Annotated[
         int | None,
@@ -70,7 +73,7 @@ def export(
 
 def _policy_file(source: Path) -> Path:
     """The policy of a run folder; any other path is that of a policy."""
-    if not source.is_dir():
+    if not os.path.isdir(source):  # noqa: PTH112 (no error of its own where a name is too long)
         return source
     folder = RunFolder(source)
     folder.config()  # an error if this is not a run folder
@@ -109,7 +112,7 @@ def _write_policy(policy: Policy, out: Path, dtype: str, source: Path) -> str:
             f"--dtype {dtype}, but .safetensors files of kreps hold float64 only; leave it "
             "out, or write an .onnx file"
         )
-    if out.resolve() == source.resolve():
+    if os.path.realpath(out) == os.path.realpath(source):
         raise ConfigurationError(
             f"--out {out} is the file that is read; it would overwrite the exact policy, so choose "
             "another name"

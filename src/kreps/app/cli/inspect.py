@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from kreps.app.cli.paths import PATH
 from kreps.app.cli.runs import RunArgument, learnt, require_checkpoint
 from kreps.app.console import say_command
 from kreps.app.evaluation import evaluate_run, say_evaluation, write_evaluation
@@ -62,7 +63,9 @@ def diagnose(
     run: RunArgument,
     out: Annotated[
         Path | None,
-        typer.Option(help="A .png, .pdf or .svg file; diagnosis.png in the run if not given."),
+        typer.Option(
+            help="A .png, .pdf or .svg file; diagnosis.png in the run if not given.", **PATH
+        ),
     ] = None,
 ) -> None:
     """Explain what limits a run and what to try, and draw it on one page.
@@ -90,7 +93,7 @@ def video(
     stochastic: Annotated[bool, typer.Option(help="With exploration noise.")] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the rollout.")] = 0,
     out: Annotated[
-        Path | None, typer.Option(help="A .gif file; video.gif in the run if not given.")
+        Path | None, typer.Option(help="A .gif file; video.gif in the run if not given.", **PATH)
     ] = None,
 ) -> None:
     """Film the policy in its environment."""

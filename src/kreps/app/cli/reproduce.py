@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from kreps.app.cli.paths import PATH
 from kreps.app.console import say_command
 from kreps.errors import ConfigurationError
 from kreps.experiments.claims import write_claims
@@ -32,7 +33,7 @@ SchedulerOption = Annotated[
     str | None,
     typer.Option(metavar="ADDRESS", help="Run on the Dask cluster of this scheduler instead."),
 ]
-ResultsOption = Annotated[Path, typer.Option(help="Folder for results.")]
+ResultsOption = Annotated[Path, typer.Option(help="Folder for results.", **PATH)]
 
 
 def reproduce(

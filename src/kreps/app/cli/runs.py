@@ -9,12 +9,16 @@ from typing import Annotated
 
 import typer
 
+from kreps.app.cli.paths import PATH
 from kreps.app.environments import environment_of
 from kreps.app.run_folder import RunFolder
 from kreps.errors import ConfigurationError
 from kreps.learning.methods import KREPS
 
-RunArgument = Annotated[Path, typer.Argument(help="Folder of the run.", show_default=False)]
+RunArgument = Annotated[
+    Path,
+    typer.Argument(help="Folder of the run.", show_default=False, **{**PATH, "metavar": "RUN"}),
+]
 
 
 @contextmanager

@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from kreps.app.cli.paths import PATH
 from kreps.app.cli.runs import RunArgument
 from kreps.app.cli.settings import parse_setting
 from kreps.app.console import say, say_command
@@ -46,7 +47,7 @@ def train(
             "current folder."
         ),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for the run; must not hold one yet.")],
+    out: Annotated[Path, typer.Option(help="Folder for the run; must not hold one yet.", **PATH)],
     iterations: Annotated[int, typer.Option(min=1, help="Policy updates to make.")] = 20,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same policy.")] = 0,
     preset: Annotated[
@@ -95,8 +96,10 @@ def train(
     folder = RunFolder(out)
     with environment_of(config) as env:
         learner = _learner(config, env)  # settings are checked before a folder is made
-        folder.create(config)
-        evaluation = _learn(folder, learner, iterations, report)
+        folder.make()
+        with folder.learning():
+            folder.create(config)
+            evaluation = _learn(folder, learner, iterations, report)
     _finish(folder, learner, evaluation)
 
 
@@ -110,7 +113,7 @@ def resume(
     """Continue a run from its last update; the result is that of an uninterrupted run."""
     folder = RunFolder(run)
     config = folder.config()
-    with environment_of(config) as env:
+    with folder.learning(), environment_of(config) as env:
         if folder.checkpoint_file.exists():
             learner = KREPS.resume(folder.checkpoint_file, env)
         else:  # stopped before the first update

@@ -1,6 +1,6 @@
 """Policies, rollouts and checkpoints as files."""
 
-from kreps.learning.storage.atomic import write_atomically
+from kreps.learning.storage.atomic import remove_parts, write_atomically
 from kreps.learning.storage.checkpoints import (
     POLICIES_OF_METHOD,
     load_checkpoint,
@@ -26,6 +26,7 @@ __all__ = [
     "load_checkpoint",
     "load_policy",
     "load_rollouts",
+    "remove_parts",
     "require_storable",
     "rollout_folder",
     "save_checkpoint",

@@ -6,6 +6,7 @@ import os
 import secrets
 import stat
 from contextlib import suppress
+from glob import escape
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,10 @@ KINDS = {
     stat.S_IFSOCK: "a socket",
 }
 """What a path may be besides a regular file."""
+
+
+PART = ".{}.{}.part"
+"""Name of a temporary file: of the target's name and of what makes it unique."""
 
 
 def given_path(path: Any) -> Path:
@@ -58,7 +63,7 @@ def write_atomically(path: str | Path, content: bytes) -> None:
     """
     path = file_path(path)
     target = Path(os.path.realpath(path))
-    part = target.with_name(f".{target.name[:40]}.{secrets.token_hex(8)}.part")
+    part = target.with_name(PART.format(target.name[:40], secrets.token_hex(8)))
     try:
         mode = _mode(path, target)
         try:
@@ -79,6 +84,17 @@ def write_atomically(path: str | Path, content: bytes) -> None:
         raise StorageError(
             f"cannot write {path}: {error}; check the folder and its space"
         ) from error
+
+
+def remove_parts(path: Path) -> None:
+    """Remove the temporary files beside a path that killed processes left.
+
+    No other process may write this path in the meantime.
+    """
+    parts = path.parent.glob(PART.format(escape(path.name[:40]), "*"))
+    for part in parts:
+        with suppress(OSError):
+            part.unlink()
 
 
 def _mode(path: Path, target: Path) -> int | None:
