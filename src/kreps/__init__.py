@@ -14,6 +14,7 @@ from kreps.envs.registration import register as _register
 from kreps.errors import (
     ConfigurationError,
     DataError,
+    DataWarning,
     EnvironmentFailure,
     KrepsError,
     NumericalError,
@@ -47,6 +48,7 @@ __all__ = [
     "Compute",
     "ConfigurationError",
     "DataError",
+    "DataWarning",
     "Dataset",
     "EnvironmentFailure",
     "Exploration",

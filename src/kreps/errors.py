@@ -50,6 +50,10 @@ class DataError(KrepsError, ValueError):
     """Invalid data: wrong types or shapes, NaN, infinities, no rollout or no step."""
 
 
+class DataWarning(UserWarning):
+    """Data that are learnt from although they look like errors of measurement."""
+
+
 class EnvironmentFailure(KrepsError, RuntimeError):
     """The environment raised an exception; the learner is as after the last update."""
 

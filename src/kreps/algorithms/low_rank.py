@@ -43,6 +43,7 @@ from kreps.algorithms.streaming import (
 )
 from kreps.data.compute import Compute
 from kreps.data.dataset import Chunk, Dataset
+from kreps.data.outliers import in_data_set, warn_of_outliers
 from kreps.data.rollouts import Rollout
 from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray, as_float
@@ -121,9 +122,9 @@ class LowRankBatch:
             self.dataset = Dataset.from_rollouts(window.rollouts, chunk_size=compute.chunk_size)
         self.size = len(self.dataset)
         read = list(compute.map(ChunkRewards(self.task), self.dataset.chunks))
-        self.terminated = np.concatenate([terminated for _, terminated, _ in read])
+        self.terminated = np.concatenate([chunk.terminated for chunk in read])
         self.all_rewards, self.reward_unit, self.end = standardise_with_end(
-            np.concatenate([rewards for rewards, _, _ in read]),
+            np.concatenate([chunk.rewards for chunk in read]),
             self.terminated,
             settings.restart_probability,
         )
@@ -132,7 +133,8 @@ class LowRankBatch:
         self.data = self.dataset.take(self.in_memory)
         self.rewards = self.all_rewards[self.in_memory]
         if isinstance(samples, Dataset):
-            self.seen = sum(rollouts for _, _, rollouts in read), self.size
+            warn_of_outliers(in_data_set((chunk.rollouts, chunk.outliers) for chunk in read))
+            self.seen = sum(chunk.rollouts for chunk in read), self.size
             self.actions = self.data.actions
         else:
             self.seen = len(samples), sum(map(len, samples))

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from kreps.algorithms.reps import Expectation, ValueFeatures
 from kreps.data.dataset import Chunk
+from kreps.data.outliers import Outlier, find_outliers
 from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.errors import DataError
@@ -30,9 +31,18 @@ ToDevice = Callable[[FloatArray], Array]
 """Copies an array to the device on which the worker computes."""
 
 
+class ChunkSummary(NamedTuple):
+    """What is needed of a chunk before it is used: rewards and terminations (n,), and outliers."""
+
+    rewards: FloatArray
+    terminated: BoolArray
+    rollouts: int
+    outliers: list[Outlier]
+
+
 @dataclass(frozen=True)
 class ChunkRewards:
-    """Rewards (n,) and terminations (n,) of a chunk, and its number of rollouts.
+    """The `ChunkSummary` of a chunk.
 
     Raises:
         DataError: the widths of observations or actions are not those of the task.
@@ -40,8 +50,9 @@ class ChunkRewards:
 
     task: TaskSpec
 
-    def __call__(self, chunk: Chunk) -> tuple[FloatArray, BoolArray, int]:
-        data = chunk.load().transitions
+    def __call__(self, chunk: Chunk) -> ChunkSummary:
+        rollouts = chunk.load()
+        data = rollouts.transitions
         found = data.points.shape[1], data.actions.shape[1]
         wanted = self.task.observation_size, self.task.action_size
         if found != wanted:
@@ -50,7 +61,7 @@ class ChunkRewards:
                 f"action coordinates, but the task has {wanted[0]} and {wanted[1]}; "
                 "give rollouts of this task"
             )
-        return data.rewards, data.terminated, len(data.start)
+        return ChunkSummary(data.rewards, data.terminated, len(rollouts), find_outliers(rollouts))
 
 
 @dataclass(frozen=True)

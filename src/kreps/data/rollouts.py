@@ -205,15 +205,18 @@ class Rollouts(Sequence[Rollout]):
         ):
             values = np.array(as_array(name, given), dtype=np.float64, subok=False)
             if (row := first_invalid_row(values)) is not None:
-                starts = self.offsets[:-1]
-                if name == "observations":
-                    starts = starts + np.arange(len(self))
-                rollout = int(np.searchsorted(starts, row, side="right")) - 1
-                where = f"row {row - starts[rollout]} of rollout {rollout}"
+                rollout, t = self.place(row, of_points=name == "observations")
+                where = f"row {t} of rollout {rollout}"
                 raise DataError(f"{invalid(name)}, first in {where}; {_DROP}")
             arrays.append(_read_only(values))
         points, actions, rewards = arrays
         return Rollouts(points, actions, rewards, self.offsets, self.terminated)
+
+    def place(self, row: int, *, of_points: bool = False) -> tuple[int, int]:
+        """The rollout of a step, or of a row of ``points``, and the row's number in it."""
+        starts = self.offsets[:-1] + (np.arange(len(self)) if of_points else 0)
+        rollout = int(np.searchsorted(starts, row, side="right")) - 1
+        return rollout, int(row - starts[rollout])
 
     def load(self) -> Rollouts:
         """Itself: it is in memory already (see `kreps.data.dataset.Chunk`)."""

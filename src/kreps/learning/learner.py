@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from kreps.algorithms.state import LearnerState, UpdateReport
 from kreps.data.dataset import Dataset
+from kreps.data.outliers import find_outliers, warn_of_outliers
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
@@ -286,6 +287,8 @@ class Learner(Generic[MethodSettings]):
         new = Rollouts.from_list(rollouts)
         if not new:
             raise DataError("there is no new rollout to learn from; give at least one")
+        new.check(self.task)
+        warn_of_outliers(find_outliers(new, self.state.window.rollouts))
         return self._update(new)
 
     @default_errstate()
