@@ -10,6 +10,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from matplotlib import rcParams
@@ -28,6 +29,7 @@ from kreps.app.progress_file import ADDED_COLUMNS, COLUMNS, max_rank, progress_r
 from kreps.app.run_folder import RunConfig, RunFolder
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import StorageError
+from kreps.models.model_errors import ModelErrors
 from kreps.presets import settings_of
 from kreps.settings import Grid, Settings
 
@@ -74,6 +76,15 @@ HEALTHY: dict[str, Any] = {
     "rejected": 0.0,
     "reward_lower_quartile": -70.0,
     "reward_upper_quartile": -50.0,
+    "dynamics_error": 0.1,
+    "worst_dynamics_error": 0.2,
+    "worst_coordinate": 1,
+    "termination_error": 0.5,
+    "reward_error": 0.3,
+    "mean_return": -3000.0,
+    "terminated": 0.0,
+    "time_limit": 200,
+    "restart_probability": 0.02,
 }
 
 
@@ -530,18 +541,23 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         jitter=0.0,
         noise=0.09,
         model_error=float("nan"),
+        held_out=ModelErrors(0.1, 0.7, 2, float("nan"), 0.4),
         clipped=0.25,
         eta_floor=0.1,
         ridge=0.03,
         rejected=True,
         seconds={},
     )
-    learner: Any = SimpleNamespace(settings=settings_of(**{"value.max_rank": 70}), exploring=True)
+    settings = settings_of(**{"value.max_rank": 70})
+    env = gym.wrappers.TimeLimit(gym.make("kreps/SwingUp-v0"), 80)
+    learner: Any = SimpleNamespace(settings=settings, exploring=True, env=env)
     iteration: Any = SimpleNamespace(
         iteration=1,
         rollouts=30,
         steps=1000,
         average_reward=-1.0,
+        mean_return=-20.0,
+        terminated=0.1,
         reward_quartiles=(-2.0, -0.5),
         update=info,
         rollout_seconds=0.1,
@@ -552,6 +568,13 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
     assert row["clipped"] == 0.25 and row["eta_floor"] == 0.1 and np.isnan(row["model_error"])
     assert row["ridge"] == 0.03 and row["exploring"] == 1.0 and row["rejected"] == 1.0
     assert (row["reward_lower_quartile"], row["reward_upper_quartile"]) == (-2.0, -0.5)
+    assert (row["dynamics_error"], row["worst_dynamics_error"]) == (0.1, 0.7)
+    assert row["worst_coordinate"] == 2 and row["reward_error"] == 0.4
+    assert np.isnan(row["termination_error"])
+    assert (row["mean_return"], row["terminated"]) == (-20.0, 0.1)
+    assert row["time_limit"] == 80 and row["restart_probability"] == 0.02
+    learner.env = gym.make("kreps/SwingUp-v0")
+    assert np.isnan(progress_row(learner, iteration)["time_limit"])
 
 
 def test_a_goal_that_was_not_reached_is_the_limit() -> None:

@@ -352,4 +352,4 @@ def test_the_example_runs_and_reports_the_fields_of_the_page(
         reported(report.update, name)
     assert set(report.update.numbers()) <= {name.rpartition(".")[2] for name in explained}
     if page.stem not in ("sample_model", "feature_reps"):  # these refer to the first page
-        assert {f.name for f in fields(info)} - {"dual"} <= set(explained)
+        assert {f.name for f in fields(info)} - {"dual", "held_out"} <= set(explained)

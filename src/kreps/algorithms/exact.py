@@ -27,7 +27,12 @@ from kreps.models.dynamics import (
     fit_dynamics,
     termination_probabilities_of_samples,
 )
-from kreps.models.reward_model import RewardModel, regressed_steps, reward_model
+from kreps.models.reward_model import (
+    RewardModel,
+    held_out_steps,
+    regressed_steps,
+    reward_model,
+)
 from kreps.models.terminations import as_probabilities
 from kreps.models.transition import (
     embedding_origin,
@@ -204,7 +209,8 @@ class ExactBatch:
         regression, x = fit_regression(data.rows(rows), targets, kernel, self.task, start, rng)
         self.jitters.append(regression.factor.jitter)
         predict, inputs = regression.predictor(targets), state_actions(data, self.task)
-        return reward_model(predict, self.rewards, data, inputs), x
+        loo = regression.leave_out_each(targets, held_out_steps(len(targets)))
+        return reward_model(predict, self.rewards, data, inputs, loo), x
 
     def weights_in_memory(self, p: FloatArray) -> FloatArray:
         return p

@@ -359,8 +359,10 @@ class LowRankBatch:
         basis = self._centres(fitted, inputs, self.low_rank.rank)
         sums = RegressionSums.from_samples(basis.features(inputs), targets)
         # scaled by the subsampling fraction, so that the subsample regularises like the full data
-        model = self._regression(basis, sums, regulariser * len(self.data) / self.size)
-        return reward_model(model.mean, self.rewards, self.data, all_inputs), x
+        scaled = regulariser * len(self.data) / self.size
+        model = self._regression(basis, sums, scaled)
+        loo = FeatureRegression.leave_one_out(basis.features(inputs), targets, scaled)
+        return reward_model(model.mean, self.rewards, self.data, all_inputs, loo), x
 
     def weights_in_memory(self, p: FloatArray) -> FloatArray:
         return p[self.in_memory] / p[self.in_memory].sum()

@@ -109,7 +109,8 @@ def model_based_step(
         latest.policy.policy, state.policy, world, model_based.acceptance_rollouts, rng
     )
     batch.clock.lap("acceptance test")
-    return replace(step, dual=latest.dual, policy=latest.policy), reward_start, rejected
+    step = replace(step, dual=latest.dual, policy=latest.policy, reward_model=world.reward_model)
+    return step, reward_start, rejected
 
 
 def generated_step(

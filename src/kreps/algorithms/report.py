@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from kreps.algorithms.dual import DualSolution
 from kreps.kernels.arrays import FloatArray
+from kreps.models.model_errors import ModelErrors
 
 
 @dataclass(frozen=True)
@@ -19,6 +20,7 @@ class UpdateInfo:
         ridge: rho times the number of samples.
         model_error: leave-one-out error of the transition model in feature space, relative to the
             change of the features (`LeaveOneOut.relative`); nan without a model.
+        held_out: leave-one-out errors of dynamics, terminations and reward, each apart.
         clipped: share of the commanded actions beyond the limits, among those of the new rollouts;
             of the window if there are no new ones, or of the subsample of a data set.
         rank: number of features of V.
@@ -46,6 +48,7 @@ class UpdateInfo:
     eta_floor: float
     ridge: float
     model_error: float
+    held_out: ModelErrors
     clipped: float
     rank: int
     rank_residual: float

@@ -99,7 +99,7 @@ class Expectation:
 
 @dataclass(frozen=True)
 class Step:
-    """The results of one bounded step, line by line."""
+    """The results of one bounded step, line by line; the reward model where one was fitted."""
 
     kernel: Kernel
     features: ValueFeatures
@@ -108,6 +108,7 @@ class Step:
     dual: DualSolution
     end: AbsorbingEnd | None
     policy: PolicyFit
+    reward_model: RewardModel | None = None
 
 
 F = TypeVar("F", bound=ValueFeatures)

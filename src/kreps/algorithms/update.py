@@ -23,6 +23,7 @@ from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout
 from kreps.errors import ConfigurationError
+from kreps.models.model_errors import model_errors
 from kreps.settings import Settings
 
 
@@ -89,6 +90,7 @@ def report(batch: Batch[Any, Any], step: Step, rejected: bool | None) -> UpdateI
         eta_floor=step.problem.eta_floor,
         ridge=stationarity_ridge(batch.settings, errors),
         model_error=float("nan") if errors is None else errors.relative,
+        held_out=model_errors(batch.data, task, step.model.dynamics, step.reward_model),
         clipped=float(np.mean(beyond)),
         rank=step.problem.rank,
         rank_residual=step.features.basis.residual,

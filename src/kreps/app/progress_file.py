@@ -3,8 +3,10 @@
 eta, its floor, dual, primal and gap are in standard deviations of the reward.  ``weighted`` is the
 number of samples with a weight in the last step of an update, generated ones included.
 ``policy_noise`` is the policy's standard deviation near its data, in units of half the action
-range.  The quartiles are those of the new rollouts' mean rewards per step,
-each counted by its steps.
+range.  The quartiles are those of the new rollouts' mean rewards per step, each counted by its
+steps.  ``mean_return`` is the mean sum of the rewards of a new rollout, which a random restart may
+have cut, ``terminated`` the share of the new rollouts that ended by a termination.  The errors of
+dynamics, terminations and reward are those of `kreps.models.model_errors`.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -20,6 +23,7 @@ from typing import Any
 from kreps.algorithms.dual import Outcome
 from kreps.checks import MAX_WHOLE_NUMBER
 from kreps.errors import StorageError
+from kreps.learning.environment import time_limit
 from kreps.learning.learner import IterationReport
 from kreps.learning.methods import KREPS
 from kreps.learning.progress import seconds_by_stage
@@ -53,11 +57,21 @@ ADDED_COLUMNS = (
     "cpu_seconds_acceptance_test",
     "reward_lower_quartile",
     "reward_upper_quartile",
+    "dynamics_error",
+    "worst_dynamics_error",
+    "worst_coordinate",
+    "termination_error",
+    "reward_error",
+    "mean_return",
+    "terminated",
+    "time_limit",
+    "restart_probability",
 )
 """Columns that runs of earlier versions lack, in the order in which they were added.
 
-A missing one is read as NaN.  Present ones may be NaN: ``model_error`` without a model,
-``max_rank`` with a fixed number of features of V, ``rejected`` without an acceptance test.
+A missing one is read as NaN.  Present ones may be NaN: the errors without such a model,
+``max_rank`` with a fixed number of features of V, ``rejected`` without an acceptance test,
+``time_limit`` of an environment that has none.
 """
 
 
@@ -96,8 +110,8 @@ COUNT, POSITIVE, NOT_NEGATIVE, SHARE = (1, MAX_WHOLE_NUMBER), (TINY, HUGE), (0, 
 
 WHOLE = {
     **dict.fromkeys(("iteration", "rollouts", "steps", "samples", "support"), COUNT),
-    **dict.fromkeys(("rank", "weighted", "max_rank"), COUNT),
-    "newton_iterations": (0, MAX_WHOLE_NUMBER),
+    **dict.fromkeys(("rank", "weighted", "max_rank", "time_limit"), COUNT),
+    **dict.fromkeys(("newton_iterations", "worst_coordinate"), (0, MAX_WHOLE_NUMBER)),
 }
 """Smallest and largest value of columns of whole numbers."""
 
@@ -105,8 +119,11 @@ RANGES = {
     **WHOLE,
     **dict.fromkeys(("kl_bound", "eta", "effective_samples", "ridge"), POSITIVE),
     **dict.fromkeys(("jitter", "eta_floor", "policy_noise", "model_error"), NOT_NEGATIVE),
+    **dict.fromkeys(("dynamics_error", "worst_dynamics_error"), NOT_NEGATIVE),
+    **dict.fromkeys(("termination_error", "reward_error"), NOT_NEGATIVE),
     **dict.fromkeys(map(seconds_column, STAGES), NOT_NEGATIVE),
-    **dict.fromkeys(("clipped", "exploring", "rejected"), SHARE),
+    **dict.fromkeys(("clipped", "exploring", "rejected", "terminated"), SHARE),
+    "restart_probability": SHARE,
 }
 """Smallest and largest value of columns whose numbers cannot be anything up to 1e100."""
 
@@ -177,9 +194,19 @@ def max_rank(settings: Settings) -> float:
     return settings.value.max_rank if isinstance(settings.value, RKHS) else math.nan
 
 
+def episode_limit(learner: KREPS) -> float:
+    """Steps after which the environment truncates an episode; NaN where it does not."""
+    limit = sys.maxsize if learner.env is None else time_limit(learner.env)
+    return math.nan if limit == sys.maxsize else limit
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
 def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
     """The row of an iteration."""
-    info, dual = report.update, report.update.dual
+    info, dual, errors = report.update, report.update.dual, report.update.held_out
     seconds = seconds_by_stage(report)
     lower, upper = report.reward_quartiles
     return {
@@ -211,8 +238,17 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "max_rank": max_rank(learner.settings),
         "ridge": info.ridge,
         "exploring": float(learner.exploring),
-        "rejected": math.nan if info.rejected is None else float(info.rejected),
+        "rejected": _or_nan(None if info.rejected is None else float(info.rejected)),
         "reward_lower_quartile": lower,
         "reward_upper_quartile": upper,
+        "dynamics_error": errors.dynamics,
+        "worst_dynamics_error": errors.worst,
+        "worst_coordinate": _or_nan(errors.worst_coordinate),
+        "termination_error": errors.terminations,
+        "reward_error": errors.reward,
+        "mean_return": report.mean_return,
+        "terminated": report.terminated,
+        "time_limit": episode_limit(learner),
+        "restart_probability": learner.settings.restart_probability,
         **{seconds_column(stage): round(seconds.get(stage, 0.0), 5) for stage in STAGES},
     }

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kreps.kernels.arrays import Array, FloatArray, as_numpy
+from kreps.kernels.arrays import Array, FloatArray, IntArray, as_numpy
 from kreps.kernels.basis import Basis, RKHSBasis
 from kreps.kernels.gram import gaussian_gram
 from kreps.kernels.kernel import Kernel
@@ -55,6 +55,12 @@ class LeaveOneOut:
         """``sqrt(sum |e_i|^2 / sum |target_i|^2)``: one is no better than predicting zero."""
         size = float(np.linalg.norm(self.targets))
         return float(np.linalg.norm(self.errors)) / size if size > 0 else 0.0
+
+    @property
+    def relative_to_spread(self) -> float:
+        """The same for centred targets: one is no better than their mean; nan if they are equal."""
+        spread = float(np.linalg.norm(self.targets - self.targets.mean(axis=0)))
+        return float(np.linalg.norm(self.errors)) / spread if spread > 0 else float("nan")
 
 
 @dataclass(frozen=True)
@@ -122,6 +128,14 @@ class KernelEmbedding:
         inverse = self.factor.inverse()
         return LeaveOneOut(targets, inverse @ targets / np.diagonal(inverse)[:, None])
 
+    def leave_out_each(self, targets: FloatArray, rows: IntArray) -> LeaveOneOut:
+        """`leave_one_out` of some samples (k,) only, at a cost of n^2 k in place of n^3."""
+        columns = np.zeros((len(targets), len(rows)))
+        columns[rows, np.arange(len(rows))] = 1.0
+        whitened = solve_lower(self.factor.lower, columns)
+        diagonal = np.einsum("ij,ij->j", whitened, whitened)
+        return LeaveOneOut(targets[rows], self.factor.solve(targets)[rows] / diagonal[:, None])
+
 
 @dataclass(frozen=True)
 class PivotedEmbedding:
@@ -167,6 +181,11 @@ class PivotedEmbedding:
     def leave_one_out(self, targets: FloatArray) -> LeaveOneOut:
         """Errors of targets (n, r) in closed form."""
         return feature_leave_one_out(self.factor, self.features, targets)
+
+    def leave_out_each(self, targets: FloatArray, rows: IntArray) -> LeaveOneOut:
+        """`leave_one_out` of some samples (k,) only."""
+        errors = self.leave_one_out(targets).errors
+        return LeaveOneOut(targets[rows], errors[rows])
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,8 @@ class IterationReport:
         iteration: number of updates, this one included.
         rollouts, steps: number of rollouts and environment steps so far.
         average_reward: mean reward per step of the new rollouts.
+        mean_return: mean sum of the rewards of a new rollout, which a restart may have cut.
+        terminated: share of the new rollouts that ended by a termination.
         reward_quartiles: lower and upper quartile of the new rollouts' mean rewards per step, in
             which each rollout counts by its steps, as in the average.
         update: the method's own report of the update, with CPU seconds by stage.
@@ -63,6 +65,8 @@ class IterationReport:
     rollouts: int
     steps: int
     average_reward: float
+    mean_return: float
+    terminated: float
     reward_quartiles: tuple[float, float]
     update: Any
     rollout_seconds: float
@@ -261,6 +265,8 @@ class Learner(Generic[MethodSettings]):
                 rollouts=self.state.rollouts,
                 steps=self.state.steps,
                 average_reward=float(rollouts.rewards.mean()),
+                mean_return=float(rollouts.rewards.sum()) / len(rollouts),
+                terminated=float(rollouts.terminated.mean()),
                 reward_quartiles=rollouts.reward_quartiles(),
                 update=info,
                 rollout_seconds=seconds,

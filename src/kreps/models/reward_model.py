@@ -9,6 +9,11 @@ import numpy as np
 
 from kreps.data.rollouts import Transitions
 from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.kernels.regression import LeaveOneOut
+
+MAX_HELD_OUT = 300
+"""Largest number of steps whose leave-one-out error is computed: enough to tell a good model from a
+poor one, at a small part of the cost of the regression."""
 
 MIN_SHARE = 0.5
 """Smallest share of steps without a termination at which these alone are regressed."""
@@ -27,6 +32,7 @@ class RewardModel:
         at_termination: what the reward of a terminating step exceeds the regression by, on average.
         smallest, largest: observed rewards.  Predictions are clipped to them, as a regression may
             overshoot.
+        loo: leave-one-out errors of the regression, at some steps; None if they are not known.
     """
 
     regression: Callable[[FloatArray], FloatArray]
@@ -34,6 +40,7 @@ class RewardModel:
     at_termination: float
     smallest: float
     largest: float
+    loo: LeaveOneOut | None = None
 
     def __call__(self, inputs: FloatArray, probabilities: FloatArray) -> FloatArray:
         """Expected rewards (m,).
@@ -56,11 +63,17 @@ def regressed_steps(data: Transitions) -> IntArray:
     return going_on if len(going_on) >= MIN_SHARE * len(data) else np.arange(len(data))
 
 
+def held_out_steps(count: int) -> IntArray:
+    """Numbers of at most `MAX_HELD_OUT` of some regressed steps, evenly spaced."""
+    return np.arange(0, count, -(-count // MAX_HELD_OUT))
+
+
 def reward_model(
     regression: Callable[[FloatArray], FloatArray],
     rewards: FloatArray,
     data: Transitions,
     inputs: FloatArray,
+    loo: LeaveOneOut | None = None,
 ) -> RewardModel:
     """The reward model from its regression.
 
@@ -69,6 +82,7 @@ def reward_model(
         rewards: (n,) standardised.
         data: n transitions.
         inputs: (n, ds + da) their states and scaled, applied actions.
+        loo: leave-one-out errors of the regression.
     """
     mean = float(rewards.mean())
     ended = np.flatnonzero(data.terminated)
@@ -76,4 +90,5 @@ def reward_model(
     if len(ended) and len(regressed_steps(data)) < len(data):
         predicted = mean + regression(inputs[ended])[:, 0]
         at_termination = float(np.mean(rewards[ended] - predicted))
-    return RewardModel(regression, mean, at_termination, float(rewards.min()), float(rewards.max()))
+    low, high = float(rewards.min()), float(rewards.max())
+    return RewardModel(regression, mean, at_termination, low, high, loo)
