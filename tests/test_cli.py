@@ -20,6 +20,7 @@ from PIL import Image
 
 import kreps
 from kreps.app import cli
+from kreps.app.progress_file import ADDED_COLUMNS
 from kreps.app.run_folder import RunFolder
 from kreps.data.task import TaskSpec
 from kreps.kernels.kernel import Kernel, factors_of
@@ -706,7 +707,8 @@ def test_a_progress_file_of_version_0_1_has_present_names(old_run: Path) -> None
     rows = RunFolder(old_run).rows()
     assert len(rows) == len(old) == 2
     for row, stored in zip(rows, old, strict=True):
-        later = {"reward_lower_quartile": "nan", "reward_upper_quartile": "nan"}
+        first = ADDED_COLUMNS.index("reward_lower_quartile")  # added after version 0.1
+        later = dict.fromkeys(ADDED_COLUMNS[first:], "nan")
         known = set(row) - set(later)
         assert row == {name: stored[OLD_COLUMNS.get(name, name)] for name in known} | later
         assert len(known) == len(stored) and set(OLD_COLUMNS) <= known

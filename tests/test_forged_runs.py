@@ -61,12 +61,15 @@ def text_of(rows: list[dict[str, str]]) -> str:
 # ---- progress.csv -----------------------------------------------------------------------------
 
 COUNTS = ["iteration", "rollouts", "steps", "samples", "support", "rank", "weighted", "max_rank"]
+COUNTS += ["time_limit"]
 POSITIVE = ["kl_bound", "eta", "effective_samples", "ridge"]
 NOT_NEGATIVE = [
     *("jitter", "eta_floor", "policy_noise", "model_error", "newton_iterations"),
+    *("dynamics_error", "worst_dynamics_error", "worst_coordinate"),
+    *("termination_error", "reward_error"),
     *(name for name in COLUMNS if name.startswith("cpu_seconds")),
 ]
-SHARES = ["clipped", "exploring", "rejected"]
+SHARES = ["clipped", "exploring", "rejected", "terminated", "restart_probability"]
 ANY_SIZE = ["inf", "-inf", "1e101", "-1e200", "", "x", "1e999", "\x1b[2J", "9" * 5000]
 IMPOSSIBLE: dict[str, list[str]] = dict.fromkeys(COLUMNS, ANY_SIZE)
 for names, values in (
@@ -108,7 +111,7 @@ for names, values in (
     (POSITIVE, ["1e-100", "1", "1e100"]),
     (NOT_NEGATIVE, ["0", "1", "1e100"]),
     (SHARES, ["0", "1"]),
-    (["newton_iterations"], ["0", "1000000000000000"]),
+    (["newton_iterations", "worst_coordinate"], ["0", "1000000000000000"]),
     (["iteration"], ["1000000000000000"]),
     (["outcome"], [*Outcome.__members__]),
 ):

@@ -49,6 +49,10 @@ def rows(count: int) -> list[dict[str, str]]:
             "effective_samples": str(20.0 + i),
             "samples": "100",
             "weighted": "100",
+            "rollouts": str(4 * (i + 1)),
+            "mean_return": str(25 * (-90.0 + 10 * i)),
+            "terminated": "0.0",
+            "time_limit": "nan",
         }
         for i in range(count)
     ]

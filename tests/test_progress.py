@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -40,9 +42,19 @@ def report(iteration: int) -> Any:
         iteration=iteration,
         steps=500 * iteration,
         average_reward=-1.234e-6,
+        mean_return=-6.17e-5,
         update=Update(),
         rollout_seconds=0.1,
     )
+
+
+def learner(
+    exploring: bool = False, terminated: bool = False, env: gym.Env[Any, Any] | None = None
+) -> Any:
+    """What the table reads of a learner."""
+    rollouts = SimpleNamespace(terminated=np.array([False, terminated]))
+    state = SimpleNamespace(window=SimpleNamespace(rollouts=rollouts))
+    return SimpleNamespace(exploring=exploring, env=env, state=state)
 
 
 class Screen:
@@ -84,7 +96,7 @@ def screens(
     monkeypatch.setattr(progress, "Console", lambda: console)
     with ProgressTable(iterations) as table:
         for i in range(1, iterations + 1):
-            table(SimpleNamespace(exploring=False), report(i))  # type: ignore[arg-type]
+            table(learner(), report(i))
             table._live.refresh()
             screen.receive(out.getvalue())
             out.truncate(0)
@@ -136,15 +148,37 @@ def test_a_lost_output_does_not_end_learning(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(progress, "Console", lambda: Console(file=Full()))
     with ProgressTable(2) as table:
         for i in (1, 2):
-            table(SimpleNamespace(exploring=False), report(i))  # type: ignore[arg-type]
+            table(learner(), report(i))
     assert isinstance(table._console.file, Output)
     assert table._console.file.error is not None
 
 
 def test_in_a_file_each_iteration_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with ProgressTable(2) as table:
-        table(SimpleNamespace(exploring=True), report(1))  # type: ignore[arg-type]
+        table(learner(exploring=True), report(1))
     first, last = capsys.readouterr().out.splitlines()
     assert first.startswith("iter 1  steps 500  reward -1.234e-06  KL / bound 0.239 / 1")
     assert "no state-dependent reward: exploring" in first
     assert last.startswith("CPU seconds: rollouts 0.1, basis 0.1")
+
+
+def test_the_return_is_shown_where_the_task_ends_episodes(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    limited = gym.wrappers.TimeLimit(gym.make("kreps/SwingUp-v0"), 80)
+    for ends in (learner(env=limited), learner(terminated=True)):
+        with ProgressTable(1) as table:
+            table(ends, report(1))
+        assert "reward -1.234e-06  return -6.17e-05  KL" in capsys.readouterr().out
+    with ProgressTable(1) as table:
+        table(learner(env=gym.make("kreps/SwingUp-v0")), report(1))
+    assert "return" not in capsys.readouterr().out
+
+
+def test_all_columns_fit_in_eighty_letters_with_a_return(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = io.StringIO()
+    console = Console(file=out, force_terminal=True, width=80, height=24)
+    monkeypatch.setattr(progress, "Console", lambda: console)
+    with ProgressTable(1) as table:
+        table(learner(terminated=True), report(1))
+    assert re.search(r"iter +steps +reward +return +KL / bound.* CPU s", out.getvalue())

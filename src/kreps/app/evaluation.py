@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 from rich.table import Table
 
@@ -12,6 +12,8 @@ from kreps.app.console import console, say
 from kreps.app.run_folder import RunFolder
 from kreps.data.rollouts import Rollouts
 from kreps.kernels.threads import blas_threads
+from kreps.learning.environment import time_limit
+from kreps.learning.episodes import EpisodicReturn, episodic_return
 from kreps.learning.evaluate import (
     Evaluation,
     discounted_average,
@@ -28,7 +30,7 @@ STORED_ROLLOUTS, STORED_NUMBERS = 10, 500_000
 def evaluate_run(
     learner: KREPS, episodes: int, steps: int, seed: int
 ) -> tuple[dict[str, Evaluation], Rollouts]:
-    """Average reward per step of the stochastic and the greedy policy.
+    """Average reward per step of the stochastic and the greedy policy, and return per episode.
 
     Args:
         learner: with an environment and at least one update.
@@ -40,26 +42,45 @@ def evaluate_run(
         The evaluation by policy, and the rollouts of the greedy policy.
     """
     assert learner.env is not None and learner.state.policy is not None
-    found = {}
+    found, limit = {}, time_limit(learner.env)
     with console().status("evaluating ..."), blas_threads(1):
         for name, policy in stochastic_and_greedy(learner.state.policy).items():
             rollouts = evaluation_rollouts(
                 learner.env, learner.task, policy, episodes=episodes, steps=steps, seed=seed
             )
-            found[name] = discounted_average(rollouts, learner.settings.restart_probability)
+            average = discounted_average(rollouts, learner.settings.restart_probability)
+            episodic = episodic_return(rollouts, steps, limit)
+            found[name] = replace(average, episodic=episodic)
     return found, rollouts  # of the greedy policy, the last one
 
 
 def say_evaluation(found: Mapping[str, Evaluation]) -> None:
-    """Print an evaluation as a table."""
+    """Print an evaluation as a table, with the returns where the task ends episodes."""
     first = next(iter(found.values()))
     say(f"Average reward per step, {first.episodes} rollouts of up to {first.steps} steps:")
     table = Table()
-    for heading in ("policy", "mean", "2 s.e."):
+    headings = ["policy", "mean", "2 s.e."]
+    episodic = [result.episodic for result in found.values() if result.episodic is not None]
+    if episodic:
+        headings += ["return per episode", "2 s.e.", "steps"]
+    for heading in headings:
         table.add_column(heading)
     for name, result in found.items():
-        table.add_row(name, f"{result.mean:.5g}", f"{2 * result.standard_error:.2g}")
+        cells = [name, *_with_error(result)]
+        if result.episodic is not None:
+            cells += [*_with_error(result.episodic), f"{result.episodic.length:.4g}"]
+        table.add_row(*cells)
     console().print(table)
+    cut = max((1.0 - each.whole for each in episodic), default=0.0)
+    if cut > 0.0:
+        say(
+            f"Up to {cut:.0%} of the episodes were cut at {first.steps} steps, and their return "
+            "lacks what would have followed; --steps follows them longer."
+        )
+
+
+def _with_error(result: Evaluation | EpisodicReturn) -> tuple[str, str]:
+    return f"{result.mean:.5g}", f"{2 * result.standard_error:.2g}"
 
 
 def write_evaluation(

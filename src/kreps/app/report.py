@@ -16,7 +16,8 @@ from kreps.app.evaluation import evaluate_run, write_evaluation
 from kreps.app.pictures import draw_run, film_run
 from kreps.app.run_folder import RunFolder
 from kreps.errors import KrepsError
-from kreps.learning.environment import batch_model_of
+from kreps.learning.environment import batch_model_of, time_limit
+from kreps.learning.episodes import EpisodicReturn, evaluated_steps
 from kreps.learning.evaluate import EPISODES, STEPS, Evaluation
 from kreps.learning.methods import KREPS
 
@@ -41,6 +42,7 @@ def evaluate_at_end(folder: RunFolder, learner: KREPS) -> dict[str, Evaluation]:
     if batch_model_of(learner.env) is None:
         episodes, steps = SHORT_EVALUATION
         say(f"a short evaluation; `kreps evaluate {folder.path}` makes a full one")
+    steps = evaluated_steps(steps, time_limit(learner.env))
     measured = _attempt("evaluation", lambda: evaluate_run(learner, episodes, steps, seed=0))
     if measured is None:
         return {}
@@ -100,6 +102,7 @@ def _say_summary(folder: RunFolder, learner: KREPS, evaluation: Mapping[str, Eva
             f" The learnt policy earns {_with_error(greedy)} per step without noise and "
             f"{_with_error(stochastic)} with it (± 2 standard errors)."
             + compared(greedy.mean, references_of(folder.config()))
+            + _returns(greedy.episodic, stochastic.episodic)
         )
     elif rows:
         text += f" The last training rollouts earned {float(rows[-1]['average_reward']):.4g}."
@@ -112,8 +115,18 @@ def _say_summary(folder: RunFolder, learner: KREPS, evaluation: Mapping[str, Eva
         )
 
 
-def _with_error(result: Evaluation) -> str:
+def _with_error(result: Evaluation | EpisodicReturn) -> str:
     return f"{result.mean:.4g} ± {2 * result.standard_error:.2g}"
+
+
+def _returns(greedy: EpisodicReturn | None, stochastic: EpisodicReturn | None) -> str:
+    """A sentence with the returns over whole episodes; empty where the task ends none."""
+    if greedy is None or stochastic is None:
+        return ""
+    return (
+        f" Whole episodes return {_with_error(greedy)} without noise, in {greedy.length:.4g} steps "
+        f"on average, and {_with_error(stochastic)} with it, in {stochastic.length:.4g}."
+    )
 
 
 def compared(reward: float, references: Mapping[str, float]) -> str:

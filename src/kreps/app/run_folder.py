@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from kreps.app.progress_file import progress_row, progress_text, read_progress
 from kreps.data.rollouts import Rollouts
 from kreps.errors import ConfigurationError, StorageError
 from kreps.intake import MAX_MAGNITUDE
+from kreps.learning.episodes import EpisodicReturn
 from kreps.learning.learner import IterationReport
 from kreps.learning.methods import KREPS
 from kreps.learning.storage import load_rollouts, remove_parts, save_policy, write_atomically
@@ -153,10 +154,12 @@ class RunFolder:
             )
         return rows
 
-    def evaluation(self, iteration: int) -> dict[str, dict[str, float]] | None:
+    def evaluation(self, iteration: int) -> dict[str, dict[str, Any]] | None:
         """Mean and standard error of the stochastic and the greedy policy of an iteration.
 
         They are those of ``evaluation.json``; None if it is missing or of another iteration.
+        ``"episodic"`` has the fields of `kreps.learning.episodes.EpisodicReturn`, where they were
+        recorded.
 
         Raises:
             StorageError: it is not what an evaluation writes.
@@ -205,16 +208,26 @@ class RunFolder:
         learner.save(self.checkpoint_file)
 
 
-def _evaluated(content: Any) -> dict[str, float]:
-    """Mean and standard error of one policy; that of earlier versions is 0.
+def _evaluated(content: Any) -> dict[str, Any]:
+    """The numbers of one policy; a standard error that earlier versions lack is 0.
 
     Raises:
         ValueError, TypeError, OverflowError, KeyError: these are no finite numbers.
     """
-    found = {"mean": content["mean"], "standard_error": content.get("standard_error", 0.0)}
-    for name, value in found.items():
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise TypeError(f"{name} is {value!r:.40}, no number")
-        if not abs(float(value)) <= MAX_MAGNITUDE:
-            raise ValueError(f"{name} is {value:g}, no number up to {MAX_MAGNITUDE:g}")
-    return {name: float(value) for name, value in found.items()}
+    average = {"standard_error": 0.0, **content}
+    found: dict[str, Any] = {
+        name: _number(name, average[name]) for name in ("mean", "standard_error")
+    }
+    if content.get("episodic") is not None:
+        episodic = content["episodic"]
+        names = (field.name for field in fields(EpisodicReturn))
+        found["episodic"] = {name: _number(name, episodic[name]) for name in names}
+    return found
+
+
+def _number(name: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise TypeError(f"{name} is {value!r:.40}, no number")
+    if not abs(float(value)) <= MAX_MAGNITUDE:
+        raise ValueError(f"{name} is {value:g}, no number up to {MAX_MAGNITUDE:g}")
+    return float(value)

@@ -16,6 +16,7 @@ from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray, default_errstate
 from kreps.learning.collect import longest_rollout, simulate
+from kreps.learning.episodes import EpisodicReturn
 from kreps.learning.wrappers import Environment, without_restarts
 from kreps.policies.base import LearntPolicy, StochasticPolicy
 from kreps.policies.exploration import WHITE, noise_rows
@@ -47,12 +48,15 @@ class Evaluation:
         standard_error: of the mean; 0 if there is only one rollout.
         episodes: number of rollouts.
         steps: largest number of steps of a rollout.
+        episodic: undiscounted return of the same rollouts; None if the task ends no episode, or if
+            it was not asked for.
     """
 
     mean: float
     standard_error: float
     episodes: int
     steps: int
+    episodic: EpisodicReturn | None = None
 
 
 def evaluation_rollouts(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import textwrap
 from collections.abc import Mapping, Sequence
 from itertools import accumulate
@@ -20,6 +21,7 @@ from rich.progress import (
 from rich.table import Table
 from rich.text import Text
 
+from kreps.learning.environment import time_limit
 from kreps.terminal import Output
 
 if TYPE_CHECKING:
@@ -42,13 +44,21 @@ def seconds_by_stage(report: IterationReport) -> dict[str, float]:
     return {"rollouts": report.rollout_seconds, **report.update.seconds}
 
 
+def ends_episodes(learner: Learner[Any]) -> bool:
+    """Whether the task ends episodes: by a time limit, or by a termination in the window."""
+    if learner.env is not None and time_limit(learner.env) < sys.maxsize:
+        return True
+    return bool(learner.state.window.rollouts.terminated.any())
+
+
 class ProgressTable:
     """A callback that shows each iteration as a row, and the remaining time.
 
     In a terminal a row stays where it was printed, above a bar at the bottom, so that the newest
     row and the bar are visible in a window of any height.  The headings are repeated before they
     leave the window.  Columns that do not fit in its width are left out; all numbers are in the
-    reports.
+    reports.  "reward" is per step; "return", where the task ends episodes, is the mean sum of the
+    rewards of the new rollouts, which random restarts may have cut.
 
     Args:
         target: number of updates after which learning ends.
@@ -107,6 +117,7 @@ class ProgressTable:
             "iter": f"{report.iteration}",
             "steps": f"{report.steps}",
             "reward": f"{report.average_reward:.4g}",
+            **({"return": f"{report.mean_return:.4g}"} if ends_episodes(learner) else {}),
             **shown,
             "CPU s": f"{sum(stages.values()):.2f}",
         }

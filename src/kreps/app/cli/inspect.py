@@ -15,6 +15,8 @@ from kreps.app.pictures import draw_diagnosis, draw_run, film_run
 from kreps.app.report import say_diagnosis
 from kreps.app.run_folder import RunFolder
 from kreps.checks import MAX_COUNT
+from kreps.learning.environment import time_limit
+from kreps.learning.episodes import LONGEST_EPISODE, evaluated_steps
 from kreps.learning.evaluate import EPISODES, STEPS
 from kreps.learning.methods import KREPS
 
@@ -35,12 +37,25 @@ def evaluate(
     episodes: Annotated[
         int, typer.Option(min=2, max=MAX_COUNT, help="Rollouts per policy.")
     ] = EPISODES,
-    steps: Annotated[int, typer.Option(min=1, help="Steps of each, without restarts.")] = STEPS,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help=f"Steps of each, without restarts; {STEPS} if not given, or a longer time limit "
+            f"of the environment up to {LONGEST_EPISODE}.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the evaluation.")] = 0,
 ) -> None:
-    """Measure the average reward per step of the policy, with and without exploration noise."""
+    """Measure the average reward per step of the policy, with and without exploration noise.
+
+    Where the environment ends episodes, by terminations or a time limit, the undiscounted return
+    over whole episodes is measured too.
+    """
     folder = RunFolder(run)
     with learnt(folder) as learner:
+        assert learner.env is not None
+        steps = steps or evaluated_steps(STEPS, time_limit(learner.env))
         found, rollouts = evaluate_run(learner, episodes, steps, seed)
     say_evaluation(found)
     write_evaluation(folder, learner, found, rollouts, seed)

@@ -68,6 +68,17 @@ def kl_share(rows: Sequence[Row]) -> float:
     return float(np.median(column(late, "kl") / column(late, "kl_bound")))
 
 
+def rollout_lengths(rows: Sequence[Row]) -> FloatArray:
+    """Mean number of steps of the new rollouts of each iteration: (m,)."""
+    steps, rollouts = column(rows, "steps"), column(rows, "rollouts")
+    return np.diff(steps, prepend=0.0) / np.maximum(np.diff(rollouts, prepend=0.0), 1.0)
+
+
+def ends_episodes(rows: Sequence[Row]) -> bool:
+    """Whether the task ends episodes: by a time limit, or by terminations that were observed."""
+    return bool(np.isfinite(latest(rows, "time_limit")) or (column(rows, "terminated") > 0.0).any())
+
+
 def learnt_rewards(rows: Sequence[Row]) -> FloatArray:
     """Training rewards per step of the batches that learnt policies collected: (k,), k < m.
 

@@ -11,7 +11,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.transforms import ScaledTranslation
 
-from kreps.app.diagnosis.columns import Row, column, effective_share
+from kreps.app.diagnosis.columns import (
+    Row,
+    column,
+    effective_share,
+    ends_episodes,
+    rollout_lengths,
+)
 from kreps.plotting import (
     BLUE,
     GREY,
@@ -27,6 +33,11 @@ EVALUATED = {"stochastic": ("D", ORANGE, -5.0), "greedy": ("s", PURPLE, 5.0)}
 """Marker, colour and horizontal offset in points of each evaluated policy."""
 
 
+COMPARABLE_LENGTH = 0.8
+"""Mean length of training rollouts, as a share of that of evaluated episodes, from which on returns
+are drawn on one axis."""
+
+
 def learning_curve(
     rows: Sequence[Row],
     references: Mapping[str, float],
@@ -34,6 +45,8 @@ def learning_curve(
     title: str,
 ) -> Figure:
     """Average reward against environment steps, above KL divergence and effective sample size.
+
+    Where the task ends episodes, the return is between them.
 
     Args:
         rows: of ``progress.csv``.
@@ -43,8 +56,14 @@ def learning_curve(
     """
     steps = column(rows, "steps")
     with rc_context(STYLE):
-        figure = Figure(figsize=(7.0, 6.0))
-        top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(4, 1, 1))
+        if ends_episodes(rows):
+            figure = Figure(figsize=(7.0, 8.5))
+            plots = figure.subplots(4, 1, sharex=True, height_ratios=(4, 2, 1, 1))
+            top, returns, middle, bottom = plots
+            draw_returns(returns, rows, evaluation)
+        else:
+            figure = Figure(figsize=(7.0, 6.0))
+            top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(4, 1, 1))
         draw_rewards(top, rows, references, evaluation)
         figure.suptitle(title, x=0.02, ha="left", fontsize=10, fontweight="bold")
         middle.plot(steps, column(rows, "kl"), "o-", color=BLUE, ms=3)
@@ -87,9 +106,47 @@ def draw_rewards(
         axes.fill_between(steps_before, lower, upper, color=BLUE, alpha=0.15, lw=0, label=label)
     draw_references(axes, references)
     _draw_evaluation(axes, steps[-1], intervals)
+    if intervals:  # beside the last step they are in no data coordinates, so no axis heeds them
+        axes.update_datalim([(steps[-1], value) for value in np.ravel(ends)])
     if limits is not None:
         mark_beyond(axes, steps_before, rewards, limits, BLUE)
     axes.set_ylabel("average reward per step")
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, columnspacing=1.5)
+
+
+def draw_returns(axes: Axes, rows: Sequence[Row], evaluation: Mapping[str, Any] | None) -> None:
+    """Mean sum of the rewards of the new rollouts, and the return of evaluated episodes.
+
+    Random restarts cut rollouts.  Where they are much shorter than an episode, their returns are
+    not comparable, and those of the episodes are given in numbers only.
+    """
+    steps, length = column(rows, "steps"), rollout_lengths(rows)
+    before = np.concatenate([[0.0], steps[:-1]])
+    axes.plot(
+        before,
+        column(rows, "mean_return"),
+        "o-",
+        color=BLUE,
+        ms=4,
+        label=f"training rollouts ({length[-1]:.3g} steps)",
+    )
+    for name, (marker, colour, _) in EVALUATED.items():
+        episodic = evaluation[name].get("episodic") if evaluation else None
+        if episodic is None:
+            continue
+        comparable = length[-1] > COMPARABLE_LENGTH * episodic["length"]
+        mean, error = _interval(episodic)
+        axes.errorbar(
+            [steps[-1]],
+            [mean if comparable else np.nan],
+            [error],
+            fmt=marker,
+            color=colour,
+            ms=5,
+            capsize=3,
+            label=f"{name}: {mean:.4g} ± {error:.2g} ({episodic['length']:.3g} steps)",
+        )
+    axes.set_ylabel("return\nper rollout")
     axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, columnspacing=1.5)
 
 
