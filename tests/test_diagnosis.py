@@ -23,10 +23,13 @@ from kreps.algorithms.dual import Outcome
 from kreps.app import cli, diagnosis_page, report
 from kreps.app.cli.settings import parse_setting
 from kreps.app.diagnosis import Finding, diagnose, thresholds
-from kreps.app.diagnosis.columns import effective_share
+from kreps.app.diagnosis.columns import average_rewards, effective_share
 from kreps.app.diagnosis.trend import Trend, trend
 from kreps.app.progress_file import ADDED_COLUMNS, COLUMNS, max_rank, progress_row
 from kreps.app.run_folder import RunConfig, RunFolder
+from kreps.data.rollouts import Rollout, Rollouts
+from kreps.data.task import TaskSpec
+from kreps.data.window import ReplayWindow
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import StorageError
 from kreps.models.model_errors import ModelErrors
@@ -43,10 +46,16 @@ CAUSES = {
     "effective sample size",
     "acceptance test",
     "transition model",
+    "dynamics",
+    "terminations",
+    "reward model",
+    "rollout length",
     "basis of V",
     "exploration noise",
     "clipped actions",
 }
+OF_SAMPLES = {"idle columns", "action cost"}
+OF_EPISODES = {"episodes"}
 RISING = list(np.linspace(-90.0, -30.0, 12))
 LEVEL = [-90.0, -70.0, -50.0, -42.0, -40.0, -40.0, -40.5, -39.5, -40.0, -40.2, -39.8, -40.0]
 FALLING = [-90.0, -60.0, -30.0, -30.0, -30.0, -30.0, -33.0, -36.0, -39.0, -42.0, -45.0, -48.0]
@@ -159,6 +168,7 @@ FIRST_FAILED = {"outcome": ["NOT_CONVERGED"] + ["AT_FLOOR"] * 11}
 LATE_FAILED = {"outcome": ["AT_FLOOR"] * 9 + ["NOT_CONVERGED"] + ["AT_FLOOR"] * 2}
 SELDOM_AT_FLOOR = {"kl": [0.1] * 12, "outcome": ["AT_FLOOR"] * 7 + ["BOUND_ACTIVE"] * 5}
 AT_FLOOR: dict[str, Any] = {"kl": 0.1, "eta": 0.1, "outcome": "AT_FLOOR"}
+DOUBLE_PENDULUM: dict[str, Any] = {"reward_error": 0.954, "average_reward": LEVEL}  # R^2 = 0.09
 FULL: dict[str, Any] = {"rank": 400, "max_rank": 400}
 ON_A_GRID: dict[str, Any] = {"max_rank": "nan", "rank_residual": 0.0}
 
@@ -198,6 +208,33 @@ CASES: list[tuple[str, str, str, dict[str, Any]]] = [
     ("transition model", "note", "not fall", {"model_error": 0.5}),
     ("transition model", "note", "0.50", {"model_error": 0.5, "count": 2}),
     ("transition model", "fine", "0.39", {"model_error": 0.39}),
+    ("dynamics", "limit", "0.85 of their size", {"dynamics_error": 0.85}),
+    ("dynamics", "note", "0.50 of their size", {"dynamics_error": 0.5}),
+    (
+        "dynamics",
+        "note",
+        "0.71 in the worst column of observations (1)",
+        {"worst_dynamics_error": 0.71},
+    ),
+    ("dynamics", "fine", "0.10 of their size", {}),
+    ("reward model", "limit", "explains 9% of the variance", DOUBLE_PENDULUM),
+    ("reward model", "note", "explains 9% of the variance", {"reward_error": 0.954}),
+    ("reward model", "note", "explains 64% of the variance", {"reward_error": 0.6}),
+    ("reward model", "limit", "explains 0%", DOUBLE_PENDULUM | {"reward_error": 3.0}),
+    ("reward model", "fine", "explains 91% of the variance", {}),
+    ("terminations", "note", "0.90", {"termination_error": 0.9, "terminated": 0.6}),
+    ("terminations", "fine", "hardly any", {"termination_error": 1.1, "terminated": 0.01}),
+    ("terminations", "fine", "0.50", {"terminated": 0.6}),
+    (
+        "rollout length",
+        "note",
+        "50 steps on average, and an episode up to 1000",
+        {"time_limit": 1000},
+    ),
+    ("rollout length", "note", "restart_probability=0.002", {"time_limit": 1000}),
+    ("rollout length", "fine", "up to 1000", {"time_limit": 1000, "terminated": 0.6}),
+    ("rollout length", "fine", "up to 200", {}),
+    ("basis of V", "limit", "cap of 400 features, which costs", FULL | {"rank_residual": 0.6}),
     ("basis of V", "limit", "400", FULL | {"rank_residual": 0.6}),
     ("basis of V", "note", "value.max_rank=800", FULL | {"rank_residual": 0.2}),
     ("basis of V", "fine", "0.01", FULL | {"rank_residual": 0.01}),
@@ -223,6 +260,211 @@ def test_each_finding_has_its_severity_and_its_text(
     assert says in f"{found.sentence} {found.remedy}"
     assert found.sentence.endswith(".") and found.sentence[0] == found.sentence[0].upper()
     assert bool(found.remedy) == (severity != "fine")
+
+
+def test_a_run_at_the_best_reference_is_not_limited_by_a_reward_that_hardly_varies() -> None:
+    best = next(iter(REFERENCES.values()))
+    level = {"average_reward": best, "reward_error": 0.954}
+    assert finding("reward model", evaluation(best, best), REFERENCES, **level).severity == "note"
+    assert (
+        finding("reward model", evaluation(-80.0, -80.0), REFERENCES, **level).severity == "limit"
+    )
+
+
+@pytest.mark.parametrize("without", ["dynamics_error", "termination_error", "reward_error"])
+def test_models_that_do_not_exist_have_no_finding(without: str) -> None:
+    named = {
+        "dynamics_error": "dynamics",
+        "termination_error": "terminations",
+        "reward_error": "reward model",
+    }
+    assert named[without] not in {f.name for f in diagnose(rows(**{without: "nan"}))}
+
+
+def test_rollouts_have_no_length_to_compare_without_a_time_limit() -> None:
+    assert "rollout length" not in {f.name for f in diagnose(rows(time_limit="nan"))}
+
+
+# ---- terminations and returns -----------------------------------------------------------------
+
+
+def episodic(mean: float, length: float, terminated: float, average: float) -> dict[str, Any]:
+    policy = {
+        "mean": average,
+        "standard_error": 0.0,
+        "episodic": {
+            "mean": mean,
+            "standard_error": 0.0,
+            "length": length,
+            "terminated": terminated,
+            "whole": 1.0,
+        },
+    }
+    return {"iteration": 12, "stochastic": policy, "greedy": policy}
+
+
+STANDING = {"average_reward": 1.0, "time_limit": 1000}
+"""A reward of being alive, which is the same in every step."""
+
+
+def test_the_reward_of_rollouts_that_end_early_counts_the_steps_that_are_missing() -> None:
+    falls_later = {"terminated": [0.9] * 4 + list(np.linspace(0.9, 0.0, 8))}
+    assert "The reward rises" in finding("progress", **STANDING, **falls_later).sentence
+    assert "The reward rises" not in finding("progress", **STANDING).sentence
+    found = average_rewards(rows(average_reward=1.0, terminated=0.5))
+    np.testing.assert_allclose(found, 50.0 / (50.0 + 0.5 * 50.0))  # p = 0.02: 50 steps to a restart
+    for unknown in ({"terminated": "nan"}, {"restart_probability": 0.0, "terminated": 0.5}):
+        np.testing.assert_array_equal(average_rewards(rows(average_reward=1.0, **unknown)), 1.0)
+
+
+def test_episodes_that_fall_early_are_the_limit_where_steps_pay() -> None:
+    fallen = finding("episodes", episodic(21.0, 21.0, 1.0, 0.4), **STANDING)
+    assert fallen.severity == "limit" and "21 steps of at most 1000" in fallen.sentence
+    stands = finding("episodes", episodic(1000.0, 1000.0, 0.0, 1.0), **STANDING)
+    assert stands.severity == "fine" and "returns 1000 in 1000 steps" in stands.sentence
+    goal = finding("episodes", episodic(-60.0, 60.0, 1.0, -0.4), average_reward=-1.0)
+    assert goal.severity == "fine"  # an early end is better where steps cost
+
+
+def test_episodes_that_earn_less_later_are_noted() -> None:
+    later = finding("episodes", episodic(-60_000.0, 1000.0, 0.0, -30.0))
+    assert later.severity == "note" and "the later ones earn less" in later.sentence
+    assert "-30" in later.sentence and "-60 per step" in later.sentence
+    assert finding("episodes", episodic(-30_000.0, 1000.0, 0.0, -30.0)).severity == "fine"
+
+
+def test_what_never_ends_has_no_finding_about_episodes() -> None:
+    for each in (None, evaluation(-31.0, -30.0)):
+        assert "episodes" not in {f.name for f in diagnose(rows(), each)}
+
+
+def test_a_solved_task_of_staying_alive_is_no_goal_that_was_not_reached() -> None:
+    learnt = {"exploring": [0.0] * 11 + [1.0], "terminated": [0.9] * 6 + [0.0] * 6}
+    solved = finding("goal", episodic(1000.0, 1000.0, 0.0, 1.0), **STANDING, **learnt)
+    assert solved.severity == "note" and "last 1000 steps" in solved.sentence
+    assert "not reached" not in solved.sentence and "as it is" in solved.remedy
+    falls = finding("goal", episodic(300.0, 300.0, 1.0, 0.9), **STANDING, **learnt)
+    assert falls.severity == "note" and "longer rollouts" in falls.remedy
+
+
+def greedy(*each: Any) -> Rollouts:
+    return Rollouts.from_list(
+        [Rollout(np.zeros((len(r) + 1, 1)), np.zeros((len(r), 1)), np.asarray(r)) for r in each]
+    )
+
+
+def length_finding(rewards: Rollouts, **changes: Any) -> Finding | None:
+    found = diagnose(rows(**changes), None, None, None, rewards)
+    return next((f for f in found if f.name == "rollout length"), None)
+
+
+def test_rollouts_are_too_short_where_the_reward_rises_after_them() -> None:
+    late = [np.repeat([-90.0, -10.0], 50)] * 2  # the goal is reached after 50 steps
+    found = length_finding(greedy(*late))
+    assert found is not None and found.severity == "limit" and "higher by 80" in found.sentence
+    assert "restart_probability=0.01)" in found.remedy
+    early = [np.repeat([-90.0, -10.0, -10.0], [20, 30, 50])] * 2
+    assert "higher" not in str(length_finding(greedy(*early)))
+    fine = length_finding(greedy(*early), time_limit="nan")
+    assert fine is not None and fine.severity == "fine"
+    noise = np.random.default_rng(0).normal(-50.0, 100.0, (3, 100))
+    noisy = length_finding(greedy(*noise))
+    assert noisy is not None and noisy.severity == "fine"
+    assert length_finding(greedy(np.zeros(60), np.zeros(60)), time_limit="nan") is None
+
+
+# ---- samples ----------------------------------------------------------------------------------
+
+
+def window(*extra: Any, cost: float = 0.1, seed: int = 0, task: TaskSpec | None = None) -> Any:
+    """A point that a policy pushes to zero; ``extra`` columns are functions of x (T,) and rng."""
+    rng, found = np.random.default_rng(seed), []
+    for _ in range(20):
+        x, v, states, pushes = rng.normal(), 0.0, [], []
+        for _ in range(40):
+            states.append([x, v])
+            push = np.clip(-x - v + 0.3 * rng.normal(), -1.0, 1.0)
+            pushes.append(push)
+            x, v = x + 0.1 * v, v + 0.1 * push
+        points = np.array([*states, [x, v]])
+        more = [make(points[:, 0], rng) for make in extra]
+        points, actions = np.column_stack([points, *more]), np.array(pushes)[:, None]
+        rewards = -(points[:-1, 0] ** 2) - cost * actions[:, 0] ** 2
+        found.append(Rollout(points, actions, rewards))
+    task = task or TaskSpec(2 + len(extra), [-1.0], [1.0])
+    return ReplayWindow(task, None).append(found)
+
+
+def about_samples(samples: Any, name: str) -> Finding:
+    (one,) = [f for f in diagnose(rows(), None, None, samples) if f.name == name]
+    return one
+
+
+def noise(x: Any, rng: np.random.Generator) -> Any:
+    return 1e3 * rng.normal(size=len(x))
+
+
+def test_idle_columns_are_found_and_named() -> None:
+    def constant(x: Any, rng: Any) -> Any:
+        return np.full(len(x), 7.0)
+
+    def copy(x: Any, rng: Any) -> Any:
+        return 1e-6 * x + 3.0
+
+    found = about_samples(window(noise, constant, copy), "idle columns")
+    assert found.severity == "note" and found.value == 2
+    assert "3 never changes; 4 is a copy of 0; 2 is noise" in found.sentence
+    still = about_samples(window(constant), "idle columns")  # it changes no distance
+    assert still.severity == "fine" and "2 never changes" in still.sentence
+
+
+def test_columns_that_tell_something_are_not_idle() -> None:
+    def jumping_goal(x: Any, rng: Any) -> Any:
+        return np.full(len(x), rng.normal())
+
+    def phase(x: Any, rng: Any) -> Any:
+        return np.sin(3.0 * np.arange(len(x)))
+
+    found = about_samples(window(jumping_goal, phase), "idle columns")
+    assert found.severity == "fine" and "None of the 4" in found.sentence
+
+
+@pytest.mark.parametrize("power", [1, 2])
+def test_noise_that_the_reward_or_a_successor_depends_on_is_no_idle_column(power: int) -> None:
+    samples = window(lambda x, rng: rng.normal(size=len(x)))
+    wanted = [
+        Rollout(r.observations, r.actions, r.rewards + r.observations[:-1, 2] ** power)
+        for r in samples.rollouts
+    ]
+    found = about_samples(ReplayWindow(samples.task, None).append(wanted), "idle columns")
+    assert found.severity == "fine"
+
+
+def test_images_have_no_idle_columns() -> None:
+    task = TaskSpec(4, [-1.0], [1.0], groups=((0, 1, 2, 3),), image_shape=(2, 2))
+    found = diagnose(rows(), None, None, window(noise, noise, task=task))
+    assert "idle columns" not in {f.name for f in found}
+
+
+def test_a_price_of_actions_that_dominates_the_reward_is_noted() -> None:
+    dear = about_samples(window(cost=30.0), "action cost")
+    assert dear.severity == "note" and dear.value > 0.8
+    # the policy acts by the state, so that actions alone explain most of the reward
+    cheap = about_samples(window(cost=0.01), "action cost")
+    assert cheap.severity == "fine" and cheap.value < 0.05
+
+
+def test_a_reward_of_large_actions_is_no_price() -> None:
+    assert about_samples(window(cost=-30.0), "action cost").value == 0.0
+
+
+def test_equal_rewards_and_few_samples_have_no_price() -> None:
+    samples = window()
+    few = ReplayWindow(samples.task, None).append(samples.rollouts[:1])
+    assert "action cost" not in {f.name for f in diagnose(rows(), None, None, few)}
+    equal = [Rollout(r.observations, r.actions, np.ones(len(r))) for r in samples.rollouts]
+    alike = ReplayWindow(samples.task, None).append(equal)
+    assert "action cost" not in {f.name for f in diagnose(rows(), None, None, alike)}
 
 
 def test_every_value_stands_to_its_limit_as_the_severity_says() -> None:
@@ -400,6 +642,10 @@ def test_causes_without_numbers_are_left_out() -> None:
     missing = {
         "acceptance test",
         "transition model",
+        "dynamics",
+        "terminations",
+        "reward model",
+        "rollout length",
         "basis of V",
         "exploration noise",
         "clipped actions",
@@ -638,7 +884,8 @@ def test_the_panels_show_the_numbers_and_their_thresholds() -> None:
         curve, *others = axes.lines
         np.testing.assert_allclose(curve.get_ydata(), value)
         np.testing.assert_array_equal(curve.get_xdata(), np.arange(1, 13))
-        levels = [float(np.asarray(line.get_ydata())[0]) for line in others]
+        dashed = [line for line in others if line.get_linestyle() == "--"]
+        levels = [float(np.asarray(line.get_ydata())[0]) for line in dashed]
         assert levels == lines
         low, high = axes.get_ylim()
         assert all(low < level < high for level in [value, *lines])
@@ -661,7 +908,7 @@ def test_one_bad_batch_flattens_no_panel() -> None:
     shown = panels(figure)
     for start, low, high, value in (
         ("Average", -150.0, 0.0, "-1.235e+05"),
-        ("Model", 0.0, 1.3, "40"),
+        ("Model", 0.0, 1.5, "40"),
     ):
         (axes,) = [axes for title, axes in shown.items() if title.startswith(start)]
         limits = axes.get_ylim()
@@ -677,7 +924,7 @@ def test_every_panel_is_marked_with_its_gravest_finding(changes: dict[str, Any])
         gravest = min(mine, key=["limit", "note", "fine"].index)
         assert axes.get_title(loc="right") == f"● {gravest}"
     shown = {name for names in diagnosis_page.PANELS.values() for name in names}
-    assert shown == CAUSES | {"goal"}
+    assert shown == CAUSES | OF_SAMPLES | OF_EPISODES | {"goal"}
 
 
 @pytest.mark.parametrize("changes", [{}, BAD], ids=["healthy", "bad"])
@@ -854,7 +1101,7 @@ PAGE = (Path(__file__).resolve().parents[1] / "docs/diagnosis.md").read_text()
 
 def test_the_page_of_the_documentation_explains_every_finding() -> None:
     headings = [line.removeprefix("## ") for line in PAGE.splitlines() if line.startswith("## ")]
-    assert set(headings[:-1]) == CAUSES | {"goal"}
+    assert set(headings[:-1]) == CAUSES | OF_SAMPLES | OF_EPISODES | {"goal"}
     for section in PAGE.split("\n## ")[1:-1]:
         assert "*Why.*" in section and "*Try*" in section
 

@@ -23,6 +23,7 @@ from matplotlib.ticker import (
 from kreps.app.diagnosis import Finding, Row, Severity, thresholds
 from kreps.app.diagnosis.columns import (
     all_recorded,
+    average_rewards,
     column,
     effective_share,
     latest,
@@ -32,6 +33,7 @@ from kreps.app.diagnosis.trend import reward_trend
 from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import FloatArray
 from kreps.plotting import BLUE, GREY, STYLE, limits_of_most, mark_beyond
+from kreps.plotting import COLOURS as COLOURS_OF_CURVES
 
 COLOURS: dict[Severity, str] = {"limit": "#c0392b", "note": "#b07d10", "fine": "#2a8c7e"}
 PAGES = (".png", ".pdf", ".svg")
@@ -47,11 +49,20 @@ PANELS: dict[str, tuple[str, ...]] = {
         "local optimum",
         "progress",
         "acceptance test",
+        "episodes",
+        "rollout length",
+        "action cost",
     ),
     "KL divergence [nats]": ("KL bound",),
     "Temperature eta [s.d. of the reward]": ("KL bound", "dual solver"),
     "Effective sample size, share of all": ("effective sample size",),
-    "Model: relative leave-one-out error": ("transition model",),
+    "Model: relative leave-one-out errors": (
+        "transition model",
+        "dynamics",
+        "terminations",
+        "reward model",
+        "idle columns",
+    ),
     "Basis of V: number of features": ("basis of V",),
     "Policy s.d. [half the action range]": ("exploration noise",),
     "Actions beyond the limits, share": ("clipped actions",),
@@ -189,7 +200,7 @@ def _plain_decades(axes: Axes) -> None:
 
 
 def _draw_reward(axes: Axes, rows: Sequence[Row], references: Mapping[str, float]) -> None:
-    values = column(rows, "average_reward")
+    values = average_rewards(rows)
     shown = dict(list(references.items())[:-1])
     axes.margins(y=0.15)
     _curve_of_most(axes, rows, values, list(shown.values()))
@@ -237,11 +248,34 @@ def _draw_effective_samples(axes: Axes, rows: Sequence[Row]) -> None:
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
 
 
+ERRORS = {
+    "model_error": ("V's features", "o"),
+    "dynamics_error": ("dynamics", "s"),
+    "termination_error": ("terminations", "^"),
+    "reward_error": ("reward", "D"),
+}
+"""Columns of errors, each with its name and marker."""
+
+
 def _draw_model(axes: Axes, rows: Sequence[Row]) -> None:
-    values = column(rows, "model_error")
     note, limit = thresholds.MODEL_ERROR_NOTE, thresholds.MODEL_ERROR_LIMIT
-    shown = _curve_of_most(axes, rows, values, [0.0, 1.0])
-    top = max(1.1, 1.04 * float(np.nanmax(shown, initial=0.0)))
+    known = {name: column(rows, name) for name in ERRORS}
+    known = {name: values for name, values in known.items() if np.isfinite(values).any()}
+    if not known:
+        _curve(axes, rows, column(rows, "model_error"))
+    iterations, all_values = column(rows, "iteration"), np.concatenate([*known.values(), [np.nan]])
+    limits = limits_of_most(all_values, len(known) * (1 + len(rows) // 8), [0.0, 1.0])
+    low, high = limits or (-np.inf, np.inf)
+    for colour, (name, values) in zip(COLOURS_OF_CURVES, known.items(), strict=False):
+        label, marker = ERRORS[name]
+        shown = np.clip(values, low, high)
+        axes.plot(iterations, shown, marker + "-", color=colour, ms=3, lw=1.0, label=label)
+        if limits is not None:
+            mark_beyond(axes, iterations, values, limits, colour)
+    top = max(1.1, 1.04 * float(np.nanmax(np.minimum(all_values, high), initial=0.0)))
+    if len(known) > 1:
+        top *= 1.2  # for the names
+        axes.legend(loc="upper right", fontsize=7, ncols=4, borderaxespad=0.1, columnspacing=1.0)
     axes.set_ylim(0.0, top)
     _line(axes, note, f"note {note:g}", COLOURS["note"], below=True)
     _line(axes, limit, f"limit {limit:g}", COLOURS["limit"])

@@ -152,8 +152,14 @@ def diagnosis_of(folder: RunFolder) -> list[Finding]:
         ConfigurationError: the run has no iteration yet.
     """
     rows = folder.recorded_rows()
-    evaluation = folder.evaluation(int(rows[-1]["iteration"]))
-    found = diagnose(rows, evaluation, references_of(folder.config()))
+    iteration = int(rows[-1]["iteration"])
+    found = diagnose(
+        rows,
+        folder.evaluation(iteration),
+        references_of(folder.config()),
+        _attempt("findings about samples", folder.window),
+        _attempt("findings about episodes", lambda: folder.evaluation_rollouts(iteration)),
+    )
     return [replace(f, remedy=f.remedy.replace("RUN", str(folder.path))) for f in found]
 
 

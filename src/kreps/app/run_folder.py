@@ -18,6 +18,7 @@ from typing import Any
 from kreps.app.lock import locked
 from kreps.app.progress_file import progress_row, progress_text, read_progress
 from kreps.data.rollouts import Rollouts
+from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, StorageError
 from kreps.intake import MAX_MAGNITUDE
 from kreps.learning.episodes import EpisodicReturn
@@ -174,6 +175,16 @@ class RunFolder:
             raise StorageError(
                 f"{self.evaluation_file} is damaged ({error}); remove it, or evaluate again"
             ) from error
+
+    def window(self) -> ReplayWindow | None:
+        """The replay window of the checkpoint; None if there is none yet.
+
+        Raises:
+            StorageError: it is damaged.
+        """
+        if not self.checkpoint_file.exists():
+            return None
+        return KREPS.resume(self.checkpoint_file).state.window
 
     def evaluation_rollouts(self, iteration: int) -> Rollouts | None:
         """Rollouts of the greedy policy of an iteration, if it was evaluated; otherwise None.

@@ -86,10 +86,11 @@ def diagnose(
     """Explain what limits a run and what to try, and draw it on one page.
 
     The findings are about the dual solver, the step, the effective sample size, the acceptance
-    test, the transition model, the basis of V, the exploration and the reward, each compared with
-    a threshold.  [bold]limit[/bold]: it limits the run; [bold]note[/bold]: it may or may not;
+    test, each part of the model, the basis of V, the exploration, the reward, the returns and
+    lengths of episodes, and idle columns of the observation, each compared with a threshold.
+    [bold]limit[/bold]: it limits the run; [bold]note[/bold]: it may or may not;
     [bold]fine[/bold]: it does not.  Only the files of the run are read, so no environment is
-    needed.  After an evaluation the cost of the exploration noise is included.
+    needed.  After an evaluation the cost of the exploration noise and the returns are included.
     """
     from kreps import plotting  # noqa: F401  (first, as it makes Matplotlib importable)
     from kreps.app.diagnosis_page import check_page_name

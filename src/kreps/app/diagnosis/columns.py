@@ -79,6 +79,24 @@ def ends_episodes(rows: Sequence[Row]) -> bool:
     return bool(np.isfinite(latest(rows, "time_limit")) or (column(rows, "terminated") > 0.0).any())
 
 
+def recent_length(rows: Sequence[Row]) -> float:
+    """Median over the latest iterations of the mean number of steps of a rollout."""
+    return float(np.median(rollout_lengths(rows)[-RECENT:]))
+
+
+def average_rewards(rows: Sequence[Row]) -> FloatArray:
+    """Training reward per step of the restarting process: (m,).
+
+    As in an evaluation, the steps from a termination to the restart count with reward zero; without
+    terminations it is the column ``average_reward``.
+    """
+    rewards, ended = column(rows, "average_reward"), column(rows, "terminated")
+    probability, steps = column(rows, "restart_probability"), rollout_lengths(rows)
+    known = (ended > 0.0) & (probability > 0.0) & (steps > 0.0)
+    waiting = np.where(known, ended, 0.0) / np.where(known, probability * steps, 1.0)
+    return rewards / (1.0 + waiting)
+
+
 def learnt_rewards(rows: Sequence[Row]) -> FloatArray:
     """Training rewards per step of the batches that learnt policies collected: (k,), k < m.
 
@@ -86,7 +104,7 @@ def learnt_rewards(rows: Sequence[Row]) -> FloatArray:
     exploration policy, whose reward may be of any size.
     """
     learnt = ~(column(rows[:-1], "exploring") > 0.0)
-    return column(rows, "average_reward")[1:][learnt]
+    return average_rewards(rows)[1:][learnt]
 
 
 def reward_range(rows: Sequence[Row]) -> float:

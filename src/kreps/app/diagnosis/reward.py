@@ -7,21 +7,45 @@ from typing import Any
 
 import numpy as np
 
-from kreps.app.diagnosis.columns import Row, column, kl_share, recent
+from kreps.app.diagnosis.columns import Row, average_rewards, column, kl_share
 from kreps.app.diagnosis.finding import Finding, Severity, counted
 from kreps.app.diagnosis.remedies import MORE_DATA, higher_floor
-from kreps.app.diagnosis.thresholds import LOW_KL_SHARE, MIN_ITERATIONS, REFERENCE_TOLERANCE
+from kreps.app.diagnosis.thresholds import (
+    LOW_KL_SHARE,
+    MIN_ITERATIONS,
+    MOSTLY,
+    RECENT,
+    REFERENCE_TOLERANCE,
+)
 from kreps.app.diagnosis.trend import Course, Trend, reward_course, reward_trend
 
 Evaluation = Mapping[str, Any]
 """Of ``evaluation.json``."""
 
 
-def goal(rows: Sequence[Row]) -> Finding | None:
-    """Whether no reward depends on the state; None if one does, or if that was not recorded."""
+def goal(rows: Sequence[Row], evaluation: Evaluation | None) -> Finding | None:
+    """Whether no reward depends on the state; None if one does, or if that was not recorded.
+
+    Where staying alive is all that is rewarded, none does once no rollout terminates.
+    """
     exploring = column(rows, "exploring")
     if not exploring[-1] > 0.0:
         return None
+    episodic = evaluation["greedy"].get("episodic") if evaluation else None
+    if (column(rows, "terminated") > 0.0).any():
+        lasts = "" if episodic is None else f"; greedy episodes last {episodic['length']:.4g} steps"
+        falls = episodic is not None and episodic["terminated"] >= MOSTLY
+        return Finding(
+            "goal",
+            "note",
+            float(np.sum(exploring > 0.0)),
+            0.0,
+            f"Earlier rollouts terminated and none of the newest does{lasts}. What is left of the "
+            "reward is at most a cost of actions, so the next rollouts explore.",
+            "longer rollouts, which end as evaluated episodes do (--set restart_probability=0.01)."
+            if falls
+            else "the policy as it is: it avoids terminations, and nothing else is rewarded.",
+        )
     return Finding(
         "goal",
         "limit",
@@ -37,7 +61,20 @@ def goal(rows: Sequence[Row]) -> Finding | None:
 
 def best_estimate(rows: Sequence[Row], evaluation: Evaluation | None) -> float:
     """Reward per step of the greedy policy if evaluated, else of the latest training rollouts."""
-    return evaluation["greedy"]["mean"] if evaluation else recent(rows, "average_reward")
+    if evaluation:
+        return evaluation["greedy"]["mean"]
+    return float(np.median(average_rewards(rows)[-RECENT:]))
+
+
+def near_best(
+    rows: Sequence[Row], evaluation: Evaluation | None, references: Mapping[str, float]
+) -> bool:
+    """Whether the reward is near the best reference."""
+    values = list(references.values())
+    if not values:
+        return False
+    missing = values[0] - best_estimate(rows, evaluation)
+    return missing < REFERENCE_TOLERANCE * (values[0] - values[-1])
 
 
 def nearest_reference(references: Mapping[str, float], reward: float) -> tuple[str, float] | None:
@@ -97,12 +134,12 @@ def progress(
         )
     if course == "rises":
         return _progress("fine", found, f"The reward rises: {found}.")
-    reward, values = best_estimate(rows, evaluation), list(references.values())
-    if values and values[0] - reward < REFERENCE_TOLERANCE * (values[0] - values[-1]):
+    if near_best(rows, evaluation, references):
+        best = next(iter(references.values()))
         return _progress(
             "fine",
             found,
-            f"The reward {course}, {found}, and is near the best reference value ({values[0]:g}).",
+            f"The reward {course}, {found}, and is near the best reference value ({best:g}).",
         )
     return _level(rows, found, course)
 

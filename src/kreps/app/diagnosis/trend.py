@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from kreps.app.diagnosis.columns import Row, column, reward_range
+from kreps.app.diagnosis.columns import Row, average_rewards, reward_range
 from kreps.app.diagnosis.thresholds import (
     CONFIDENCE,
     MAX_LEVEL_RISE,
@@ -81,7 +81,7 @@ def trend(values: FloatArray) -> Trend | None:
 
 def reward_trend(rows: Sequence[Row]) -> Trend | None:
     """Trend of the training reward; None where there is none."""
-    return trend(column(rows, "average_reward"))
+    return trend(average_rewards(rows))
 
 
 def reward_course(rows: Sequence[Row]) -> Course:
