@@ -18,6 +18,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+import kreps
 from kreps import plotting
 from kreps.algorithms.dual import Outcome
 from kreps.app import cli, diagnosis_page, report
@@ -1019,6 +1020,23 @@ def test_runs_of_earlier_versions_are_diagnosed_as_far_as_they_go(
     assert code == 0 and "Fine: progress" in text and "Not recorded" in text
     code, text = call("diagnose", write_run(tmp_path / "new", rows(model_error="nan")))
     assert code == 0 and "Not recorded" not in text
+
+
+def test_a_damaged_checkpoint_leaves_out_what_is_about_samples(call: Call, tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", rows())
+    (run / "checkpoint.safetensors").write_bytes(b"nothing")
+    code, text = call("diagnose", run)
+    assert code == 0 and "no findings about samples" in text and "Fine: progress" in text
+    assert "idle columns" not in text
+
+
+def test_samples_are_read_from_the_checkpoint(tmp_path: Path) -> None:
+    run = write_run(tmp_path / "run", rows())
+    learner = kreps.KREPS(gym.make(NAME), initial_rollouts=6).learn(1, progress=False)
+    learner.save(run / "checkpoint.safetensors")
+    found = {f.name: f for f in report.diagnosis_of(RunFolder(run))}
+    assert "None of the 2 observation columns" in found["idle columns"].sentence
+    assert found["action cost"].severity == "fine"
 
 
 def test_references_of_another_process_are_not_used(tmp_path: Path) -> None:
