@@ -49,8 +49,7 @@ def evaluate(
 ) -> None:
     """Measure the average reward per step of the policy, with and without exploration noise.
 
-    Where the environment ends episodes, by terminations or a time limit, the undiscounted return
-    over whole episodes is measured too.
+    With a time limit or terminations, the return over whole episodes too.
     """
     folder = RunFolder(run)
     with learnt(folder) as learner:
