@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Executor, ThreadPoolExecutor
 from copy import deepcopy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -25,13 +25,14 @@ from kreps.algorithms.report import UpdateInfo
 from kreps.algorithms.reps import Expectation, Step, reps_step
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.algorithms.streamed_dual import StreamedProblem, coarse_to_fine, strides
+from kreps.algorithms.streaming import ExpectedSuccessors
 from kreps.algorithms.update import update
 from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
-from kreps.data.rollouts import Rollout
+from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
-from kreps.kernels.arrays import FloatArray
+from kreps.kernels.arrays import Array, FloatArray
 from kreps.kernels.basis import KernelExpansion
 from kreps.kernels.kernel import Kernel, SquaredExponential
 from kreps.kernels.regression import KernelEmbedding
@@ -394,6 +395,77 @@ def test_the_dual_in_chunks_has_the_solution_of_that_in_memory(
     assert found.eta == pytest.approx(wanted.eta, rel=1e-3)
     assert found.dual == pytest.approx(wanted.dual, abs=1e-6)
     assert np.abs(found.weights - wanted.weights).sum() < 1e-3
+
+
+@dataclass(frozen=True)
+class Counted:
+    """Expected successors, and the sizes of the chunks that they were computed for."""
+
+    successors: ExpectedSuccessors
+    made: list[int]
+
+    def __call__(self, data: Transitions) -> tuple[Array, Array]:
+        self.made.append(len(data.rewards))
+        return self.successors(data)
+
+
+def counted_problem(rollouts: list[Rollout]) -> tuple[StreamedProblem, list[int]]:
+    """A problem of 345 samples in several chunks, and the list of the rows made for it."""
+    settings = settings_for({}, LOW_VALUE)
+    problem = low_rank_step(rollouts, settings, STREAMED, IN_CHUNKS, 1e-6)[1].problem
+    assert isinstance(problem, StreamedProblem) and len(problem.dataset.chunks) > 2
+    made: list[int] = []
+    rows = replace(problem.rows, successors=Counted(problem.rows.successors, made))
+    return replace(problem, rows=rows), made
+
+
+def test_rows_are_made_once_and_give_the_same_bytes_as_rows_made_anew(
+    rollouts: list[Rollout],
+) -> None:
+    problem, made = counted_problem(rollouts)
+    theta = np.random.default_rng(0).normal(size=problem.rank)
+    kept = problem.keeping_rows()
+    assert sum(made) == 345
+    for anew, in_memory in [
+        (problem, kept),
+        (problem.part(slice(None, None, 2)), kept.part(slice(None, None, 2))),
+    ]:
+        made.clear()
+        found = in_memory.moments(0.3, theta, with_covariance=True)
+        errors = in_memory.bellman_errors(theta)
+        assert made == [] and in_memory.keeping_rows() is in_memory
+        wanted = anew.moments(0.3, theta, with_covariance=True)
+        assert sum(made) == len(anew.rewards)
+        assert (found.log_mass, found.mean_delta) == (wanted.log_mass, wanted.mean_delta)
+        np.testing.assert_array_equal(found.covariance, wanted.covariance)
+        np.testing.assert_array_equal(errors, anew.bellman_errors(theta))
+
+
+def test_rows_are_not_kept_beyond_a_limit_of_memory_nor_sent_to_processes(
+    rollouts: list[Rollout],
+) -> None:
+    problem, made = counted_problem(rollouts)
+    size = 345 * problem.rank * 8
+    assert problem.keeping_rows(size - 1).kept is None
+    elsewhere = Compute(cast(Executor, "not a pool of threads"), chunk_size=60)
+    assert replace(problem, compute=elsewhere).keeping_rows().kept is None
+    assert made == []
+    assert problem.keeping_rows(size).kept is not None
+
+
+def test_an_update_makes_the_rows_of_its_dual_once_and_releases_them(
+    rollouts: list[Rollout],
+) -> None:
+    settings = settings_for({}, LOW_VALUE)
+    batch, step = low_rank_step(rollouts, settings, STREAMED, IN_CHUNKS, 1e-6)
+    made: list[int] = []
+    model: Any = step.model
+    model = replace(model, successors=Counted(model.successors, made))
+    features: Any = step.features
+    problem, dual, _ = batch.solve_dual(features, model, 1e-6)
+    assert sum(made) == 345
+    assert problem.kept is None
+    np.testing.assert_array_equal(dual.weights, step.dual.weights)
 
 
 @pytest.mark.parametrize(

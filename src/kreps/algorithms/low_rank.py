@@ -8,6 +8,7 @@ The cost is linear in the number of samples.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial, reduce
 from operator import add
 
@@ -299,6 +300,8 @@ class LowRankBatch:
         )
         differences = feature_differences(features.own, model.expected, restart, p)
 
+        problem = problem if self.all_in_memory else problem.keeping_rows()
+
         def solve(problem: StreamedProblem, start: Start) -> DualSolution:
             if start is not None and not self.all_in_memory:
                 return solve_dual(problem, start=start)
@@ -307,7 +310,7 @@ class LowRankBatch:
 
         problem, dual, end = solve_with_end(problem, model.terminations, self.end, solve=solve)
         self.clock.lap("dual")
-        return problem, dual, end
+        return replace(problem, kept=None), dual, end
 
     def fit_policy_to_data(
         self, p: FloatArray, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator

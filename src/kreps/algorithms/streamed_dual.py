@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
 from operator import add
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from kreps.algorithms.newton import solve_dual
 from kreps.algorithms.streaming import BellmanRows
 from kreps.data.compute import Compute
 from kreps.data.dataset import Chunk, Dataset
-from kreps.kernels.arrays import FloatArray, IntArray, as_numpy, like
+from kreps.kernels.arrays import Array, FloatArray, IntArray, as_numpy, like
 
 Result = TypeVar("Result")
 
@@ -24,45 +24,69 @@ GROWTH = 4
 iteration on each of the smaller parts costs a third of one on all samples, taken together."""
 
 
+MAX_KEPT_BYTES = 2**29
+"""Rows of B up to this size (0.5 GB) are computed once per solve and kept: 160,000 samples at rank
+400.  To make them anew takes six times as long as the Hessian that a pass computes from them, and
+eighty times as long as the gradient."""
+
+
 @dataclass(frozen=True)
-class ChunkMoments:
+class MomentsOfRows:
     """`Moments` of a chunk at one point of the dual.
 
     Attributes:
-        rows: computes the rows of B.
         eta: temperature.
         theta: (r,) coordinates of V.
         with_covariance: whether the covariance is computed.
     """
 
-    rows: BellmanRows
     eta: float
     theta: FloatArray
     with_covariance: bool
 
-    def __call__(self, chunk: Chunk, rewards: FloatArray) -> Moments:
-        b = self.rows(chunk.load().transitions)
+    def __call__(self, b: Array, rewards: FloatArray) -> Moments:
+        """Of rows b (n, r) of B and rewards (n,)."""
         delta = like(rewards, b) + b @ like(self.theta, b)
         return Moments.from_rows(delta, b, self.eta, with_covariance=self.with_covariance)
 
 
 @dataclass(frozen=True)
-class ChunkErrors:
-    """Bellman errors (Eq. 5) of a chunk, (n,)."""
+class ErrorsOfRows:
+    """Bellman errors (Eq. 5) of a chunk, (n,), at theta (r,)."""
 
-    rows: BellmanRows
     theta: FloatArray
 
-    def __call__(self, chunk: Chunk, rewards: FloatArray) -> FloatArray:
-        b = self.rows(chunk.load().transitions)
+    def __call__(self, b: Array, rewards: FloatArray) -> FloatArray:
+        """Of rows b (n, r) of B and rewards (n,)."""
         return rewards + as_numpy(b @ like(self.theta, b))
 
 
 @dataclass(frozen=True)
-class StreamedProblem:
-    """A `kreps.algorithms.dual.Problem` whose rows of B are never in memory all at once.
+class ChunkRows:
+    """Rows of B of a chunk, (n, r)."""
 
-    They are computed chunk by chunk in each pass over the samples.
+    rows: BellmanRows
+
+    def __call__(self, chunk: Chunk) -> Array:
+        return self.rows(chunk.load().transitions)
+
+
+@dataclass(frozen=True)
+class OfChunk(Generic[Result]):
+    """A function of the rows of B and the rewards, as a function of the chunk and the rewards."""
+
+    function: Callable[[Array, FloatArray], Result]
+    rows: ChunkRows
+
+    def __call__(self, chunk: Chunk, rewards: FloatArray) -> Result:
+        return self.function(self.rows(chunk), rewards)
+
+
+@dataclass(frozen=True)
+class StreamedProblem:
+    """A `kreps.algorithms.dual.Problem` whose rows of B are computed chunk by chunk.
+
+    They are made anew in each pass over the samples, unless they are kept (`keeping_rows`).
 
     Attributes:
         dataset: n samples.
@@ -70,6 +94,7 @@ class StreamedProblem:
         rewards: (n,) in units of their standard deviation; the largest one is zero.
         kl_bound, ridge, eta_floor: as of `kreps.algorithms.dual.DualProblem`.
         compute: the workers.
+        kept: rows of B of each chunk, (n_j, r); None if each pass makes them anew.
     """
 
     dataset: Dataset
@@ -79,6 +104,7 @@ class StreamedProblem:
     ridge: float
     eta_floor: float
     compute: Compute
+    kept: tuple[Array, ...] | None = None
 
     @property
     def rank(self) -> int:
@@ -86,19 +112,37 @@ class StreamedProblem:
 
     def part(self, chosen: slice) -> StreamedProblem:
         """The problem of a slice of the chunks, with the same ridge."""
-        rewards = self.dataset.split(self.rewards)[chosen]
         return replace(
-            self, dataset=Dataset(self.dataset.chunks[chosen]), rewards=np.concatenate(rewards)
+            self,
+            dataset=Dataset(self.dataset.chunks[chosen]),
+            rewards=np.concatenate(self.dataset.split(self.rewards)[chosen]),
+            kept=None if self.kept is None else self.kept[chosen],
         )
 
+    def keeping_rows(self, limit: int = MAX_KEPT_BYTES) -> StreamedProblem:
+        """The same problem, with its rows in memory if they take at most ``limit`` bytes.
+
+        Results have the same bytes.  The rows are not kept either if the workers are in other
+        processes, to which they would have to be sent in each pass.
+        """
+        size = len(self.rewards) * self.rank * np.dtype(np.float64).itemsize
+        if self.kept is not None or size > limit or not self.compute.shares_memory:
+            return self
+        rows = self.compute.map(ChunkRows(self.rows), self.dataset.chunks)
+        return replace(self, kept=tuple(rows))
+
     def bellman_errors(self, theta: FloatArray) -> FloatArray:
-        return np.concatenate(list(self._map(ChunkErrors(self.rows, theta))))
+        return np.concatenate(list(self._map(ErrorsOfRows(theta))))
 
     def moments(self, eta: float, theta: FloatArray, *, with_covariance: bool) -> Moments:
-        return reduce(add, self._map(ChunkMoments(self.rows, eta, theta, with_covariance)))
+        return reduce(add, self._map(MomentsOfRows(eta, theta, with_covariance)))
 
-    def _map(self, function: Callable[[Chunk, FloatArray], Result]) -> Iterator[Result]:
-        return self.compute.map(function, self.dataset.chunks, self.dataset.split(self.rewards))
+    def _map(self, function: Callable[[Array, FloatArray], Result]) -> Iterator[Result]:
+        rewards = self.dataset.split(self.rewards)
+        if self.kept is not None:
+            return self.compute.map(function, self.kept, rewards)
+        of_chunk = OfChunk(function, ChunkRows(self.rows))
+        return self.compute.map(of_chunk, self.dataset.chunks, rewards)
 
 
 def coarse_to_fine(
@@ -137,7 +181,7 @@ def coarse_to_fine(
     for stride in strides(n, subsample_size):
         part = problem.part(slice(None, None, stride))
         part = replace(part, ridge=ridge / min(GROWTH * len(part.rewards), n))
-        dual = solve_dual(part, start=(dual.eta, dual.theta))
+        dual = solve_dual(part.keeping_rows(), start=(dual.eta, dual.theta))
     return dual
 
 

@@ -41,14 +41,18 @@ class Compute:
     to_device: Callable[[FloatArray], Array] = as_float
     chunk_size: int = CHUNK_SIZE
 
+    @property
+    def shares_memory(self) -> bool:
+        """Whether the work is done in this process, so that arguments are not copied."""
+        return self.executor is None or isinstance(self.executor, ThreadPoolExecutor)
+
     def map(self, function: Callable[..., Result], *arguments: Iterable[Any]) -> Iterator[Result]:
         """The results in the order of the arguments, so that sums do not depend on timing."""
         if self.executor is None:
             yield from map(function, *arguments)
             return
         # threads share the BLAS of this process and would override each other's limits
-        other_process = not isinstance(self.executor, ThreadPoolExecutor)
-        work = partial(_on_one_thread, function) if other_process else function
+        work = function if self.shares_memory else partial(_on_one_thread, function)
         pending: deque[Future[Result]] = deque()
         try:
             for each in zip(*arguments, strict=True):
