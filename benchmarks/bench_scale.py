@@ -1,6 +1,7 @@
 """Complete low-rank updates by `learner.update`.
 
-``python benchmarks/low_rank.py scale`` measures up to a million samples, and memory.
+``python benchmarks/low_rank.py scale`` measures up to a million samples, and memory;
+``python benchmarks/smooth.py`` more data sets of the second kind.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import gymnasium as gym
 import numpy as np
 from criteria import Seconds, TimesAsLong
 from measuring import Measure
+from smooth import CASES
 
 from kreps import KREPS, Rollout
 from kreps.learning.collect import simulate
@@ -46,5 +48,18 @@ def bench_update_from_many(measure: Measure) -> None:
         lambda: update(large),
         Seconds(at_most=60.0),
         TimesAsLong(f"n = {small:,}", lambda: update(small), at_most=12.0),
+        rounds=1,
+    )
+
+
+def bench_update_from_nearly_deterministic_samples(measure: Measure) -> None:
+    """The dual needs some hundred passes over the samples and over parts of them."""
+    n, case = 100_000, CASES["one mass at rest for long"]
+    given = case.rollouts(n)
+    measure(
+        "whole update, low rank, nearly deterministic",
+        f"n = {n:,}",
+        lambda: KREPS(case.task, seed=SEED, window=None).update(given),
+        Seconds(at_most=60.0),
         rounds=1,
     )
