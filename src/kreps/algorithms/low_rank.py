@@ -8,7 +8,6 @@ The cost is linear in the number of samples.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial, reduce
 from operator import add
 
@@ -299,7 +298,6 @@ class LowRankBatch:
             compute=self.compute,
         )
         differences = feature_differences(features.own, model.expected, restart, p)
-
         problem = problem if self.all_in_memory else problem.keeping_rows()
 
         def solve(problem: StreamedProblem, start: Start) -> DualSolution:
@@ -310,7 +308,7 @@ class LowRankBatch:
 
         problem, dual, end = solve_with_end(problem, model.terminations, self.end, solve=solve)
         self.clock.lap("dual")
-        return replace(problem, kept=None), dual, end
+        return problem.releasing_rows(), dual, end
 
     def fit_policy_to_data(
         self, p: FloatArray, kernel: Kernel, start: FloatArray | None, rng: np.random.Generator

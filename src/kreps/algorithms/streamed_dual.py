@@ -131,6 +131,10 @@ class StreamedProblem:
         rows = self.compute.map(ChunkRows(self.rows), self.dataset.chunks)
         return replace(self, kept=tuple(rows))
 
+    def releasing_rows(self) -> StreamedProblem:
+        """The same problem, whose rows are made anew in each pass."""
+        return replace(self, kept=None)
+
     def bellman_errors(self, theta: FloatArray) -> FloatArray:
         return np.concatenate(list(self._map(ErrorsOfRows(theta))))
 
