@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import operator
 from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import Any
 
 import numpy as np
 
+from kreps.checks import MAX_WHOLE_NUMBER
 from kreps.data.spaces import Spaces
-from kreps.errors import ConfigurationError, DataError, NumericalError
+from kreps.errors import ConfigurationError, DataError, NumericalError, shown
 from kreps.intake import as_array, is_sane
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Factor, factors_of
@@ -19,6 +22,15 @@ GiB."""
 
 MAX_IMAGE_SIDE = 1024
 """Pixels per side of an image: smoothing costs their square in memory and their cube in time."""
+
+PERIODS = 1e-6, 1e6
+"""Shortest and longest control period, in s."""
+
+
+def is_period(value: Any) -> bool:
+    """Whether a value can be a control period in s."""
+    number = isinstance(value, Real) and not isinstance(value, bool)
+    return number and PERIODS[0] <= float(value) <= PERIODS[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +47,9 @@ class TaskSpec:
             every coordinate must belong to an image.
         spaces: how the environment gives observations and takes actions; None: observations (ds,)
             and actions (da,) of float64.
+        dt: control period in s; None if it is not known.
+        time_limit: steps after which an episode is truncated; None if there is no limit, or none
+            that is known.
 
     Raises:
         ConfigurationError: sizes, limits or coordinates that are impossible or contradict each
@@ -48,6 +63,8 @@ class TaskSpec:
     groups: tuple[tuple[int, ...], ...] = ()
     image_shape: tuple[int, int] | None = None
     spaces: Spaces | None = None
+    dt: float | None = None
+    time_limit: int | None = None
 
     def __post_init__(self) -> None:
         try:
@@ -68,6 +85,7 @@ class TaskSpec:
                 "but a whole number and a list of whole numbers are needed, as 3 and (0, 2)"
             ) from error
         self._check_sizes()
+        self._check_time()
         if self.spaces is not None and self.spaces.sizes != self.sizes:
             raise ConfigurationError(
                 f"its spaces have {self.spaces.sizes} coordinates of observations and actions, the "
@@ -101,6 +119,24 @@ class TaskSpec:
                 f"action limits {low} to {high} must be finite and low < high, as their range is "
                 "the scale of the actions; give a bounded range"
             )
+
+    def _check_time(self) -> None:
+        if self.dt is not None:
+            if not is_period(self.dt):
+                raise ConfigurationError(
+                    f"dt = {shown(self.dt)}, but it must be a control period in s, from "
+                    f"{PERIODS[0]:g} to {PERIODS[1]:g}, or None if it is not known"
+                )
+            object.__setattr__(self, "dt", float(self.dt))
+        if self.time_limit is not None:
+            limit = self.time_limit
+            whole = isinstance(limit, Integral) and not isinstance(limit, bool)
+            if not (whole and 1 <= limit <= MAX_WHOLE_NUMBER):
+                raise ConfigurationError(
+                    f"time_limit = {shown(limit)}, but it must be a whole number of steps from 1 "
+                    f"to {MAX_WHOLE_NUMBER}, or None if there is no limit"
+                )
+            object.__setattr__(self, "time_limit", int(limit))
 
     def _check_groups(self) -> None:
         grouped = [i for group in self.groups for i in group]

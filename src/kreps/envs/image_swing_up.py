@@ -115,6 +115,7 @@ class ImageSwingUp(BatchEnvironment):
     metadata: dict[str, Any] = {  # noqa: RUF012 (declared so by gymnasium.Env)
         "render_modes": ["rgb_array"],
         "render_fps": SwingUp.metadata["render_fps"],
+        "dt": SwingUp.metadata["dt"],
         "observation_groups": (tuple(range(PIXELS**2)), tuple(range(PIXELS**2, 2 * PIXELS**2))),
         "observation_image_shape": (PIXELS, PIXELS),
         "action_labels": SwingUp.metadata["action_labels"],

@@ -149,6 +149,7 @@ class Reaching(BatchEnvironment):
     metadata: dict[str, Any] = {  # noqa: RUF012 (declared so by gymnasium.Env)
         "render_modes": ["rgb_array"],
         "render_fps": round(1.0 / TIME_STEP),
+        "dt": TIME_STEP,
         "periodic_coordinates": (0, 1),
         "observation_labels": (
             "upper arm [rad]",

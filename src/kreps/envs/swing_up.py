@@ -149,6 +149,7 @@ class SwingUp(BatchEnvironment):
     metadata: dict[str, Any] = {  # noqa: RUF012 (declared so by gymnasium.Env)
         "render_modes": ["rgb_array"],
         "render_fps": round(1.0 / TIME_STEP),
+        "dt": TIME_STEP,
         "periodic_coordinates": (0,),
         "observation_labels": ("angle from upright [rad]", "angular velocity [rad/s]"),
         "action_labels": ("torque [N m]",),

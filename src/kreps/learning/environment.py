@@ -16,12 +16,14 @@ from kreps.data.task import TaskSpec
 from kreps.envs.batch import BatchModel
 from kreps.errors import ConfigurationError, SpaceError
 from kreps.kernels.arrays import FloatArray
+from kreps.learning.control_period import control_period
 from kreps.learning.wrappers import Environment as Environment
 from kreps.learning.wrappers import (
     keeps_observations,
     metadata_of,
     warn_about_state,
     without_restarts,
+    wrappers_of,
 )
 
 ANGLES, GROUPS, IMAGE_SHAPE = (
@@ -93,6 +95,8 @@ def task_of(env: Environment, periodic: Sequence[int] | None = None) -> TaskSpec
         groups=tuple(metadata.get(GROUPS, ())),
         image_shape=metadata.get(IMAGE_SHAPE),
         spaces=spaces_of(env),
+        dt=control_period(env),
+        time_limit=None if (limit := time_limit(env)) == sys.maxsize else limit,
     )
 
 
@@ -152,7 +156,9 @@ def _observation_metadata(env: Environment, keys: tuple[str, ...]) -> dict[str, 
     return metadata
 
 
-def environment_for(env: Environment, task: TaskSpec, restart_probability: float) -> Environment:
+def environment_for(
+    env: Environment, task: TaskSpec, restart_probability: float | None
+) -> Environment:
     """The environment that a learner collects in, without its random restarts.
 
     The only way into a learner, for a new one and for one that is resumed.
@@ -160,7 +166,7 @@ def environment_for(env: Environment, task: TaskSpec, restart_probability: float
     Args:
         env: as given by the user.  There is a `UserWarning` if a wrapper has running statistics.
         task: of the learner.
-        restart_probability: of the learner.
+        restart_probability: of the learner; None if it chooses it.
 
     Raises:
         ConfigurationError: no environment, one with other sizes, limits or restarts.
@@ -206,13 +212,18 @@ def batch_model_of(env: Environment) -> BatchModel | None:
 
 
 def time_limit(env: Environment) -> int:
-    """Steps after which a `TimeLimit` wrapper truncates; ``sys.maxsize`` without one."""
-    while isinstance(env, gym.Wrapper):
-        limit = env.spec.max_episode_steps if env.spec is not None else None
-        if isinstance(env, gym.wrappers.TimeLimit) and limit is not None:
-            return int(limit)
-        env = env.env
-    return sys.maxsize
+    """Steps after which an episode is truncated; ``sys.maxsize`` if that is not known.
+
+    It is that of `TimeLimit` wrappers, or that of an environment of dm_control.
+    """
+    limits: list[Any] = [
+        wrapper.spec.max_episode_steps if wrapper.spec else vars(wrapper).get("_max_episode_steps")
+        for wrapper in wrappers_of(env)
+        if isinstance(wrapper, gym.wrappers.TimeLimit)
+    ]
+    limits.append(getattr(getattr(env.unwrapped, "_env", None), "_step_limit", None))  # shimmy
+    known = (int(each) for each in limits if isinstance(each, int | float) and each < sys.maxsize)
+    return min((limit for limit in known if limit >= 1), default=sys.maxsize)
 
 
 def observation_limits(

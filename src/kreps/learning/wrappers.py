@@ -34,6 +34,8 @@ KEEPS_ORDER = {"FlattenObservation", "ReshapeObservation"}
 """They keep the coordinates of an array, and their order."""
 
 KEEPS_ACTIONS = KEEPS_STEPS | {"ClipAction"}
+CHANGES_TIME = {"AtariPreprocessing", "MaxAndSkipObservation", "RepeatAction"}
+"""Wrappers of Gymnasium that take several steps of what they wrap in one of theirs."""
 
 
 def wrappers_of(env: Environment) -> Iterator[Wrapper]:
@@ -62,6 +64,15 @@ def keeps_actions(wrapper: Wrapper) -> bool:
         or _gymnasium_name(wrapper) in KEEPS_ACTIONS
         or _inherits(wrapper, gym.ObservationWrapper, gym.RewardWrapper)
     )
+
+
+def keeps_time(wrapper: Wrapper) -> bool:
+    """Whether a step of a wrapper is certainly one step of what it wraps."""
+    if name := _gymnasium_name(wrapper):
+        return name not in CHANGES_TIME
+    bases = (gym.Wrapper, gym.ActionWrapper, gym.ObservationWrapper, gym.RewardWrapper)
+    own = type(wrapper).step
+    return isinstance(wrapper, RandomRestart) or any(own is base.step for base in bases)
 
 
 def _gymnasium_name(wrapper: Wrapper) -> str:

@@ -56,8 +56,10 @@ TASK = Record(
                 },
             )
         ),
+        "dt": Plain(),
+        "time_limit": Plain(),
     },
-    absent={"spaces": None},
+    absent={"spaces": None, "dt": None, "time_limit": None},
 )
 
 LENGTHSCALES = Limit("between 1e-100 and 1e100", lambda v: (v > 1e-100) & (v < 1e100))
