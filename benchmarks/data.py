@@ -57,7 +57,7 @@ def next_update(iterations: int) -> Update:
         learner.settings.rollouts_per_iteration,
         seed=SEED,
         iteration=iterations,
-        restart_probability=learner.settings.restart_probability,
+        restart_probability=learner.restart_probability,
     )
     return Update(learner, learner.state, rollouts)
 

@@ -808,6 +808,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         reward_quartiles=(-2.0, -0.5),
         update=info,
         rollout_seconds=0.1,
+        restart_probability=0.02,
     )
     row = progress_row(learner, iteration)
     assert set(row) == set(COLUMNS) and row["weighted"] == 4000

@@ -127,7 +127,7 @@ def test_sampled_actions_have_the_differences_and_rewards_of_the_first_step(mode
     found = case.generate(GivenActions(data.actions), **replayed(1))
     np.testing.assert_array_equal(found.states[found.state_of], data.states)
     np.testing.assert_array_equal(found.actions, data.actions)
-    p = case.batch.settings.restart_probability
+    p = case.batch.settings.p
     wanted = feature_differences(world.features, case.step.model.expected, world.restart, p)
     assert np.abs(wanted).max() > 0.1
     np.testing.assert_allclose(found.problem.differences, wanted, atol=1e-8)
@@ -269,7 +269,7 @@ def test_states_have_their_own_features_and_the_noise_of_the_nearest_sample(
         world.phi(found.states[found.state_of]),
         world.expected_features(rows, inputs),
         world.restart,
-        settings.restart_probability,
+        settings.p,
     )
     np.testing.assert_allclose(found.problem.differences, wanted, atol=1e-7)
     # the noise of another sample would give other features

@@ -21,7 +21,7 @@ from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.collect import collect
 from kreps.learning.evaluate import Greedy, evaluate
-from kreps.learning.learner import IterationReport
+from kreps.learning.iteration import IterationReport
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.exploration import BangBang, Gaussian
 

@@ -22,7 +22,7 @@ from kreps.algorithms.report import UpdateInfo
 from kreps.experiments.search import CANDIDATES
 from kreps.experiments.specs import FIGURES, METHODS
 from kreps.kernels.kernel import IMAGE_BLUR
-from kreps.learning.learner import IterationReport
+from kreps.learning.iteration import IterationReport
 from kreps.learning.methods import LEARNERS
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 from kreps.presets import PRESETS, changed, flat
@@ -245,7 +245,7 @@ def test_the_differences_of_the_default_and_the_preset_paper_are_listed() -> Non
     listed = deviations.split("## What the default preset changes")[1].split("\n## ")[0]
     items = re.findall(r"^\d+\. `(\w+) = ([^`]+)` instead of `([^`]+)`", listed, re.MULTILINE)
     assert {name for name, *_ in items} == changed_fields("paper")
-    assert "in ten settings" in listed and len(items) == 10
+    assert "in eleven settings" in listed and len(items) == 11
     names = vars(settings)
     for name, default, paper in items:
         assert getattr(Settings(), name) == eval(default, dict(names))

@@ -17,7 +17,7 @@ import pytest
 
 import kreps
 from kreps.app.run_folder import RunConfig, RunFolder
-from kreps.learning.learner import IterationReport
+from kreps.learning.iteration import IterationReport
 
 TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 NAME = "kreps/SwingUp-v0"

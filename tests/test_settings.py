@@ -27,7 +27,7 @@ from kreps.settings import (
 # ---- presets ----------------------------------------------------------------------------------
 
 MODEL_BASED: dict[str, Any] = {
-    "restart_probability": 0.02,
+    "restart_probability": None,
     "window": 30,
     "window_steps": 1000,
     "exploration.noise": "bang-bang",
@@ -58,6 +58,7 @@ MODEL_BASED: dict[str, Any] = {
 SINGLE_STEP: dict[str, Any] = {
     **{name: v for name, v in MODEL_BASED.items() if not name.startswith("model_based.")},
     "model_based": None,
+    "restart_probability": 0.02,
     "window_steps": 0,
     "rollout_lengths": "independent",
     "eta_floor": 0.1,
@@ -311,7 +312,7 @@ NOT_FINITE = [float("inf"), float("-inf"), float("nan")]
 NO_NUMBERS = ["1", None, True, [1], 1j]
 NO_COUNTS = [0, -3, 2.5, 10.0, "10", None, True, np.float64(3)]
 OUT_OF_RANGE: dict[str, list[Any]] = {
-    "restart_probability": [0.0, 1.0, -0.1, 1.5, *NOT_FINITE, *NO_NUMBERS],
+    "restart_probability": [0.0, 1.0, -0.1, 1.5, *NOT_FINITE, "1", True, [1], 1j],
     "window": [value for value in NO_COUNTS if value is not None],
     "window_steps": [value for value in NO_COUNTS if value is not None and value != 0],
     "initial_rollouts": NO_COUNTS,

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from kreps.data.rollouts import Rollout, Rollouts
     from kreps.data.task import TaskSpec
     from kreps.envs.restart import RandomRestart
-    from kreps.learning.learner import IterationReport
+    from kreps.learning.iteration import IterationReport
     from kreps.learning.methods import KREPS, NPALP, GridValueIteration, ValueIteration
     from kreps.learning.policy import Policy, load_policy
     from kreps.learning.storage import (
@@ -84,7 +84,7 @@ _HOMES = {
     "ValueIteration": "learning.methods",
     "GridValueIteration": "learning.methods",
     "NPALP": "learning.methods",
-    "IterationReport": "learning.learner",
+    "IterationReport": "learning.iteration",
     "Policy": "learning.policy",
     "load_policy": "learning.policy",
     "check_file": "learning.storage",

@@ -27,6 +27,7 @@ from kreps.settings import (
 AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
 
 SINGLE_STEP = Settings(
+    restart_probability=0.02,
     window_steps=0,
     rollout_lengths="independent",
     eta_floor=0.1,

@@ -16,6 +16,9 @@ PolicyFitName = Literal["map", "bounded"]
 AngleWrap = Literal["discontinuous", "continuous"]
 Noise = Literal["bang-bang", "gaussian", "pink"]
 
+USUAL_RESTART_PROBABILITY = 0.02
+"""That of the paper, with rollouts of 49 steps on average."""
+
 
 # ---- sections ---------------------------------------------------------------------------------
 
@@ -155,26 +158,36 @@ class LearnerSettings(Checked):
     """The settings that all learners have.
 
     Attributes:
-        restart_probability: p, with which the process restarts at each step, in [1e-9, 1).
+        restart_probability: p, with which the process restarts at each step, in [1e-9, 1).  None
+            is chosen from the task, by `kreps.learning.timescale.restart_probability`.
         window: largest number of rollouts in the replay window, a third of them reserved for those
             with a state-dependent reward.  None keeps all.
         window_steps: smallest number of steps in the window, for which more rollouts are kept than
             ``window``: rollouts that terminate early have few.
     """
 
-    restart_probability: float = 0.02
+    restart_probability: float | None = 0.02
     window: int | None = 30
     window_steps: int = 0
 
     def __post_init__(self) -> None:
-        self._check(
-            "restart_probability", Real, "at least 1e-9 and below 1", lambda v: 1e-9 <= v < 1
-        )
+        if self.restart_probability is not None:
+            limit = "at least 1e-9 and below 1, or None to choose it from the task"
+            self._check("restart_probability", Real, limit, lambda v: 1e-9 <= v < 1)
         whole = f"a whole number from 0 to {MAX_WHOLE_NUMBER}"
         self._check("window_steps", Integral, whole, lambda v: 0 <= v <= MAX_WHOLE_NUMBER)
         if self.window is not None:
             whole = f"a whole number from 1 to {MAX_WHOLE_NUMBER}, or None to keep all"
             self._check("window", Integral, whole, lambda v: 1 <= v <= MAX_WHOLE_NUMBER)
+
+    @property
+    def p(self) -> float:
+        """The restart probability: that of a task of which nothing is known where it is None.
+
+        A learner chooses a number before it makes an update.
+        """
+        given = self.restart_probability
+        return USUAL_RESTART_PROBABILITY if given is None else given
 
 
 @dataclass(frozen=True)
@@ -239,6 +252,7 @@ class Settings(OnPolicySettings):
         model_based: `ModelBased`, or None: the paper's single step on the sampled actions.
     """
 
+    restart_probability: float | None = None
     window_steps: int = 1_000
     rollout_lengths: RolloutLengths = "stratified"
     kl_bound: float = 1.0

@@ -64,7 +64,7 @@ class ExactBatch:
         self.window, self.task, self.settings, self.clock = window, window.task, settings, clock
         self.data = exact_transitions(window)
         self.rewards, self.reward_unit, self.end = standardise_with_end(
-            self.data.rewards, self.data.terminated, settings.restart_probability
+            self.data.rewards, self.data.terminated, settings.p
         )
         self.size, self.seen = len(self.data), (len(rollouts), sum(map(len, rollouts)))
         self.actions = np.concatenate([r.actions for r in rollouts or window.rollouts])
@@ -157,9 +157,7 @@ class ExactBatch:
         settings, own = self.settings, features.own
         problem = DualProblem(
             rewards=self.rewards,
-            differences=feature_differences(
-                own, model.expected, features.restart, settings.restart_probability
-            ),
+            differences=feature_differences(own, model.expected, features.restart, settings.p),
             kl_bound=settings.kl_bound,
             ridge=stationarity_ridge(settings, model.errors) / self.size,
             eta_floor=eta_floor,

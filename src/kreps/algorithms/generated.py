@@ -106,7 +106,7 @@ def generate(
     noise = std_scale * rng.standard_normal((count, task.action_size))
     actions = policy.act(states[state_of], noise)
     inputs = np.concatenate([states[state_of], task.scaled_applied(actions)], axis=1)
-    p = settings.restart_probability
+    p = settings.p
     outcomes = expected_outcomes(world, rows[state_of], inputs, p)
     problem = DualProblem(
         rewards=outcomes.rewards + outcomes.bonus,

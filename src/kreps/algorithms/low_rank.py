@@ -126,7 +126,7 @@ class LowRankBatch:
         self.all_rewards, self.reward_unit, self.end = standardise_with_end(
             np.concatenate([chunk.rewards for chunk in read]),
             self.terminated,
-            settings.restart_probability,
+            settings.p,
         )
         self.in_memory = uniform_subsample(self.size, rng, low_rank.subsample)
         self.all_in_memory = len(self.in_memory) == self.size
@@ -286,7 +286,7 @@ class LowRankBatch:
     def solve_dual(
         self, features: StreamedFeatures, model: StreamedExpectation, eta_floor: float
     ) -> tuple[StreamedProblem, DualSolution, AbsorbingEnd | None]:
-        settings, restart, p = self.settings, features.restart, self.settings.restart_probability
+        settings, restart, p = self.settings, features.restart, self.settings.p
         ridge = stationarity_ridge(settings, model.errors)
         problem = StreamedProblem(
             dataset=self.dataset,

@@ -177,7 +177,7 @@ def world_model(
             data=batch.data,
             kernel=step.kernel,
             task=batch.task,
-            restart_probability=settings.restart_probability,
+            restart_probability=settings.p,
             exploring_starts=settings.exploring_starts,
             max_steps=max(map(len, batch.window.rollouts)),
             end_reward=0.0 if step.end is None else step.end.reward,

@@ -97,7 +97,7 @@ def update(
     distances = cdist(points, points[data.state])
     clock.lap("distances")
     rewards, unit = standardise(data.rewards)
-    gamma = 1.0 - settings.restart_probability
+    gamma = 1.0 - settings.p
     # V after a termination: reward zero, standardised, in each step
     after_end = -float(data.rewards.max()) / unit / (1.0 - gamma)
     bounds, improvements, residual = sample_bounds(
@@ -111,7 +111,7 @@ def update(
         kernel,
         data.states,
         task.clip(data.actions),
-        unit * bounds + float(data.rewards.max()) / settings.restart_probability,
+        unit * bounds + float(data.rewards.max()) / settings.p,
         unit * settings.lipschitz,
         settings.noise_fraction,
         settings.noise_scale,

@@ -24,6 +24,7 @@ class LearnerState:
         window: the replay window.
         iteration: updates made.
         rollouts, steps: rollouts and environment steps seen, forgotten ones included.
+        terminated: whether any of these rollouts ended by a termination.
         policy: the one that acts: that of the latest update, or the previous one if that was
             rejected; None before the first update.
         value: V of the latest update, also if its policy was rejected; None for methods whose V is
@@ -36,6 +37,7 @@ class LearnerState:
     iteration: int = 0
     rollouts: int = 0
     steps: int = 0
+    terminated: bool = False
     policy: LearntPolicy | None = None
     value: LinearFunction | None = None
     embedding_start: FloatArray | None = None
@@ -60,6 +62,7 @@ class LearnerState:
             iteration=self.iteration + 1,
             rollouts=self.rollouts + rollouts,
             steps=self.steps + steps,
+            terminated=self.terminated or bool(window.rollouts.terminated.any()),
             window=window,
             **learnt,
         )

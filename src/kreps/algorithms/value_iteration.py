@@ -106,7 +106,7 @@ def update(
     clock.lap("embedding")
     rewards, unit = standardise(data.rewards)
     candidates = candidate_actions(task, settings.actions)
-    gamma = 1.0 - settings.restart_probability
+    gamma = 1.0 - settings.p
     no_reward = -float(data.rewards.max()) / unit  # reward zero, standardised
     q = iterate_values(model, data, rewards, no_reward, candidates, settings.temperature, gamma)
     clock.lap("sweeps")
@@ -115,7 +115,7 @@ def update(
         model.kernel.part(slice(-task.action_size)),
         data.states,
         unit * q.table,
-        unit * q.offset + float(data.rewards.max()) / settings.restart_probability,
+        unit * q.offset + float(data.rewards.max()) / settings.p,
         candidates,
         unit * settings.temperature,
     )

@@ -12,7 +12,6 @@ from kreps.envs.references import REFERENCE_RESTART_PROBABILITY, REFERENCE_REWAR
 from kreps.learning.environment import opened
 from kreps.learning.wrappers import Environment, Wrapper, keeps_actions, keeps_observations
 from kreps.learning.wrappers import metadata_of as usable_metadata
-from kreps.settings import LearnerSettings
 from kreps.terminal import printable
 
 
@@ -69,8 +68,9 @@ def references_of(config: RunConfig) -> dict[str, float]:
     """
     if config.arguments:
         return {}
-    # only this setting is read: a run of an earlier version may have unknown ones
-    default = LearnerSettings.restart_probability
-    if config.settings.get("restart_probability", default) != REFERENCE_RESTART_PROBABILITY:
+    # Only this setting is read: a run of an earlier version may have unknown ones.  Where it is
+    # chosen, it is that of the references, as their tasks end no episode.
+    given = config.settings.get("restart_probability")
+    if given is not None and given != REFERENCE_RESTART_PROBABILITY:
         return {}
     return REFERENCE_REWARDS.get(config.environment, {})

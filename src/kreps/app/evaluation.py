@@ -48,7 +48,7 @@ def evaluate_run(
             rollouts = evaluation_rollouts(
                 learner.env, learner.task, policy, episodes=episodes, steps=steps, seed=seed
             )
-            average = discounted_average(rollouts, learner.settings.restart_probability)
+            average = discounted_average(rollouts, learner.restart_probability)
             episodic = episodic_return(rollouts, steps, limit)
             found[name] = replace(average, episodic=episodic)
     return found, rollouts  # of the greedy policy, the last one

@@ -68,7 +68,7 @@ def _draw_trajectories(folder: RunFolder, learner: KREPS, labels: Labels) -> lis
         return []
     rollouts.check(learner.task)
     longest = float(rollouts.lengths.max())
-    steps = ceil(min(SHOWN_LENGTHS / learner.settings.restart_probability, longest))
+    steps = ceil(min(SHOWN_LENGTHS / learner.restart_probability, longest))
     predicted = predicted_states(learner, rollouts[0].observations[0], steps)
     title = f"{literal(folder.config().environment)}, iteration {learner.state.iteration}"
     figure = trajectories(rollouts, predicted, steps, learner.policy.process, labels, title)

@@ -46,7 +46,7 @@ def predicted_states(learner: KREPS, start: FloatArray, steps: int) -> FloatArra
         dynamics, _, _ = fit_dynamics(
             data, kernel, learner.task, learner.state.embedding_start, rng
         )
-        probability = learner.settings.restart_probability
+        probability = learner.restart_probability
         model = ModelEnv(dynamics, data, kernel, learner.task, probability, 0.0, steps, 0.0)
         starts = np.tile(start, (PREDICTIONS, 1))
         return model.trajectories(Greedy(learner.state.policy), starts, steps, rng)

@@ -24,7 +24,7 @@ from kreps.algorithms.dual import Outcome
 from kreps.checks import MAX_WHOLE_NUMBER
 from kreps.errors import StorageError
 from kreps.learning.environment import time_limit
-from kreps.learning.learner import IterationReport
+from kreps.learning.iteration import IterationReport
 from kreps.learning.methods import KREPS
 from kreps.learning.progress import seconds_by_stage
 from kreps.legacy import present_columns
@@ -249,6 +249,6 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "mean_return": report.mean_return,
         "terminated": report.terminated,
         "time_limit": episode_limit(learner),
-        "restart_probability": learner.settings.restart_probability,
+        "restart_probability": report.restart_probability,
         **{seconds_column(stage): round(seconds.get(stage, 0.0), 5) for stage in STAGES},
     }

@@ -22,7 +22,7 @@ from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, StorageError
 from kreps.intake import MAX_MAGNITUDE
 from kreps.learning.episodes import EpisodicReturn
-from kreps.learning.learner import IterationReport
+from kreps.learning.iteration import IterationReport
 from kreps.learning.methods import KREPS
 from kreps.learning.storage import load_rollouts, remove_parts, save_policy, write_atomically
 from kreps.legacy import present_preset, present_settings

@@ -14,7 +14,8 @@ from kreps.experiments.specs import METHODS, TASKS
 from kreps.kernels.threads import blas_threads
 from kreps.learning.environment import opened
 from kreps.learning.evaluate import evaluate, stochastic_and_greedy
-from kreps.learning.learner import IterationReport, Learner
+from kreps.learning.iteration import IterationReport
+from kreps.learning.learner import Learner
 from kreps.learning.methods import LEARNERS
 from kreps.learning.progress import seconds_by_stage
 from kreps.learning.storage import write_atomically
@@ -133,7 +134,7 @@ def run_trial(trial: Trial) -> dict[str, Any]:
                     learner.env,
                     learner.task,
                     policy,
-                    restart_probability=learner.settings.restart_probability,
+                    restart_probability=learner.restart_probability,
                     episodes=trial.episodes[report.iteration == trial.iterations],
                     seed=trial.seed,
                 )

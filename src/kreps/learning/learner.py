@@ -5,10 +5,9 @@
 
 from __future__ import annotations
 
-import inspect
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Self, TypeVar
@@ -25,9 +24,10 @@ from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError, enough_memory, shown
 from kreps.kernels.arrays import default_errstate
 from kreps.kernels.threads import blas_threads
-from kreps.learning import storage
+from kreps.learning import storage, timescale
 from kreps.learning.collect import collect
 from kreps.learning.environment import Environment, environment_for, task_of
+from kreps.learning.iteration import Callback, IterationReport, callbacks_of, is_false
 from kreps.learning.policy import Policy
 from kreps.learning.wrappers import without_restarts
 from kreps.policies.base import StochasticPolicy
@@ -43,71 +43,6 @@ def _whole_number(name: str, value: Any) -> int:
             f"{name} = {shown(value)}, but it must be a whole number >= 0 of at most 128 bits"
         )
     return int(value)
-
-
-@dataclass(frozen=True)
-class IterationReport:
-    """Results of one iteration, as passed to callbacks.
-
-    Attributes:
-        iteration: number of updates, this one included.
-        rollouts, steps: number of rollouts and environment steps so far.
-        average_reward: mean reward per step of the new rollouts.
-        mean_return: mean sum of the rewards of a new rollout, which a restart may have cut.
-        terminated: share of the new rollouts that ended by a termination.
-        reward_quartiles: lower and upper quartile of the new rollouts' mean rewards per step, in
-            which each rollout counts by its steps, as in the average.
-        update: the method's own report of the update, with CPU seconds by stage.
-        rollout_seconds: CPU seconds that collecting the new rollouts took.
-    """
-
-    iteration: int
-    rollouts: int
-    steps: int
-    average_reward: float
-    mean_return: float
-    terminated: float
-    reward_quartiles: tuple[float, float]
-    update: Any
-    rollout_seconds: float
-
-
-Callback = Callable[[Any, IterationReport], bool | np.bool | None]
-"""Called with learner and report after each iteration; returning False stops learning early."""
-
-
-def _callbacks(given: Any) -> list[Callback]:
-    """The callbacks of an argument of `Learner.learn`."""
-    if given is None:
-        return []
-    try:
-        callbacks = [given] if callable(given) else list(given)
-    except TypeError:
-        callbacks = [given]
-    for each in callbacks:
-        if not callable(each) or isinstance(each, type):
-            raise ConfigurationError(
-                f"callback = {each!r:.60}, but it must be a function of learner and report, a list "
-                "of them, or None"
-                + ("; this is a class, so give an object of it" if isinstance(each, type) else "")
-            )
-        try:
-            inspect.signature(each).bind(None, None)
-        except ValueError:  # a function of C without a signature
-            continue
-        except TypeError as error:
-            raise ConfigurationError(
-                f"callback = {each!r:.60} cannot be called with learner and report ({error}); give "
-                "it these two arguments"
-            ) from error
-    return callbacks
-
-
-def _is_false(answer: Any) -> bool:
-    """Whether a callback returned False: Python's, NumPy's, or that of another array library."""
-    if getattr(answer, "ndim", None) == 0:
-        answer = answer.item()
-    return answer is False
 
 
 MethodSettings = TypeVar("MethodSettings", bound=LearnerSettings)
@@ -163,8 +98,8 @@ class Learner(Generic[MethodSettings]):
         else:
             self.task = task_of(env, periodic)
             _, probability = without_restarts(env)
-            if probability is not None:
-                settings.setdefault("restart_probability", probability)
+            if probability is not None and settings.get("restart_probability") is None:
+                settings["restart_probability"] = probability
         self.settings = self._settings(settings)
         if not isinstance(env, TaskSpec):
             self.env = environment_for(env, self.task, self.settings.restart_probability)
@@ -193,6 +128,16 @@ class Learner(Generic[MethodSettings]):
         considered.  Methods that do not collect by their own policy never explore in this way.
         """
         return False
+
+    @property
+    def restart_probability(self) -> float:
+        """p of the next rollouts and the next update: that of the settings, or as chosen."""
+        return timescale.restart_probability(self.settings, self.task, self.state.terminated)
+
+    @property
+    def update_settings(self) -> MethodSettings:
+        """The settings of the next update: nothing in them is left to be chosen."""
+        return replace(self.settings, restart_probability=self.restart_probability)
 
     @property
     def policy(self) -> Policy:
@@ -239,7 +184,7 @@ class Learner(Generic[MethodSettings]):
                 "in; pass rollouts to update(), or make the learner from an environment"
             )
         iterations = _whole_number("iterations", iterations)
-        callbacks = _callbacks(callback)
+        callbacks = callbacks_of(callback)
         if progress:
             from kreps.learning.progress import ProgressTable
 
@@ -259,6 +204,7 @@ class Learner(Generic[MethodSettings]):
             with blas_threads(self.threads, exact=True), enough_memory("collecting rollouts"):
                 rollouts = self._collect(self.env, on_rollout)
             seconds = time.process_time() - started
+            probability = self.restart_probability
             info = self.update(rollouts)
             report = IterationReport(
                 iteration=self.state.iteration,
@@ -270,8 +216,9 @@ class Learner(Generic[MethodSettings]):
                 reward_quartiles=rollouts.reward_quartiles(),
                 update=info,
                 rollout_seconds=seconds,
+                restart_probability=probability,
             )
-            if any([_is_false(each(self, report)) for each in callbacks]):
+            if any([is_false(each(self, report)) for each in callbacks]):
                 break
         return self
 
@@ -307,7 +254,7 @@ class Learner(Generic[MethodSettings]):
         return info
 
     def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:
-        return type(self).algorithm(self.state, samples, self.task, self.settings, rng)
+        return type(self).algorithm(self.state, samples, self.task, self.update_settings, rng)
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
         """The rollouts of the next iteration.
@@ -349,7 +296,7 @@ class Learner(Generic[MethodSettings]):
         state, task, settings, seed = storage.load_checkpoint(path, cls.method, cls.settings_type)
         learner = cls(task, seed=seed, **flat(settings))
         if env is not None:
-            learner.env = environment_for(env, task, settings.restart_probability)
+            learner.env = environment_for(env, learner.task, settings.restart_probability)
         learner.state = state
         return learner
 
@@ -369,7 +316,7 @@ class OnPolicyLearner(Learner[OnPolicy]):
             self._rollout_count(),
             seed=self.seed,
             iteration=self.state.iteration,
-            restart_probability=self.settings.restart_probability,
+            restart_probability=self.restart_probability,
             stratified=self.settings.rollout_lengths == "stratified",
             exponent=exponent,
             on_rollout=on_rollout,

@@ -89,7 +89,7 @@ class KREPS(OnPolicyLearner[Settings]):
         return self._update(rollouts)
 
     def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:
-        return reps_update(self.state, samples, self.settings, rng, self.compute)
+        return reps_update(self.state, samples, self.update_settings, rng, self.compute)
 
     @property
     def value_function(self) -> LinearFunction:

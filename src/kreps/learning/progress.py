@@ -25,7 +25,8 @@ from kreps.learning.environment import time_limit
 from kreps.terminal import Output
 
 if TYPE_CHECKING:
-    from kreps.learning.learner import IterationReport, Learner
+    from kreps.learning.iteration import IterationReport
+    from kreps.learning.learner import Learner
 
 GAP = "  "
 WIDTHS = {"iter": 4, "reward": 7, "ESS": 4, "CPU s": 5}

@@ -64,6 +64,7 @@ STATE = Record(
         "iteration": Whole(),
         "rollouts": Whole(),
         "steps": Whole(),
+        "terminated": Converted(Whole(bits=1), int, lambda stored, given: bool(stored)),
         "window": Converted(Optional(ROLLOUTS), _stored_window, _window),
         "policy": Optional(POLICY),
         "value": Optional(VALUE),
@@ -71,6 +72,7 @@ STATE = Record(
         "reward_start": Optional(Array(("g+w+da+1",))),
         "policy_start": Optional(Array(("g+2",))),
     },
+    absent={"terminated": 0},
 )
 """Sizes beside those of policies: w angles that wrap in V and in the reward model (0 without V),
 r centres of V, n steps and R rollouts of the window."""
@@ -164,7 +166,8 @@ def load_checkpoint(
 
 def _check_presence(stored: Any, method: str) -> None:
     """Whether the state has the parts that a learner of this method has after its updates."""
-    if not isinstance(stored, dict) or not STATE.nodes.keys() <= stored.keys():
+    needed = STATE.nodes.keys() - STATE.absent.keys()
+    if not isinstance(stored, dict) or not needed <= stored.keys():
         raise StorageError(f"its header has no state with {', '.join(STATE.nodes)}")
     learnt = stored["iteration"] != 0
     policy = stored["policy"]
