@@ -33,6 +33,7 @@ from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.errors import StorageError
+from kreps.learning.environment import task_of
 from kreps.models.model_errors import ModelErrors
 from kreps.presets import settings_of
 from kreps.settings import Grid, Settings
@@ -95,6 +96,7 @@ HEALTHY: dict[str, Any] = {
     "terminated": 0.0,
     "time_limit": 200,
     "restart_probability": 0.02,
+    "action_repeat": 1,
 }
 
 
@@ -797,7 +799,8 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
     )
     settings = settings_of(**{"value.max_rank": 70})
     env = gym.wrappers.TimeLimit(gym.make("kreps/SwingUp-v0"), 80)
-    learner: Any = SimpleNamespace(settings=settings, exploring=True, env=env)
+    task = task_of(env)
+    learner: Any = SimpleNamespace(settings=settings, exploring=True, env=env, task=task)
     iteration: Any = SimpleNamespace(
         iteration=1,
         rollouts=30,

@@ -61,7 +61,7 @@ def text_of(rows: list[dict[str, str]]) -> str:
 # ---- progress.csv -----------------------------------------------------------------------------
 
 COUNTS = ["iteration", "rollouts", "steps", "samples", "support", "rank", "weighted", "max_rank"]
-COUNTS += ["time_limit"]
+COUNTS += ["time_limit", "action_repeat"]
 POSITIVE = ["kl_bound", "eta", "effective_samples", "ridge"]
 NOT_NEGATIVE = [
     *("jitter", "eta_floor", "policy_noise", "model_error", "newton_iterations"),

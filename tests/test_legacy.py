@@ -410,13 +410,19 @@ CHANGES: dict[str, list[Any]] = {
 }
 
 
-NO_SETTINGS_THEN: dict[str, Any] = {"window_steps": 0, "restart_probability": 0.02}
+NO_SETTINGS_THEN: dict[str, Any] = {
+    "window_steps": 0,
+    "restart_probability": 0.02,
+    "action_repeat": 1,
+}
 """What the presets of today leave to other rules than version 0.1."""
 
 
 @pytest.mark.parametrize("recipe", OLD_RECIPES)
 def test_a_whole_old_recipe_is_the_present_preset(recipe: str) -> None:
-    whole = changed(Settings(window_steps=0), present_settings(OLD_RECIPES[recipe]))
+    whole = changed(
+        Settings(window_steps=0, action_repeat=1), present_settings(OLD_RECIPES[recipe])
+    )
     assert whole == settings_of(present_preset(recipe), **NO_SETTINGS_THEN)
 
 
@@ -429,7 +435,7 @@ def test_changes_of_an_old_recipe_are_changes_of_the_preset(
     for values in itertools.product(*(CHANGES[name] for name in names)):
         changes = dict(zip(names, values, strict=True))
         old = present_settings({**OLD_RECIPES[recipe], **changes})
-        whole = changed(Settings(window_steps=0), old)
+        whole = changed(Settings(window_steps=0, action_repeat=1), old)
         new = present_settings(changes, recipe)
         part = settings_of(present_preset(recipe), **NO_SETTINGS_THEN, **new)
         assert part == whole, changes

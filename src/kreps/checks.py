@@ -15,6 +15,9 @@ MAX_COUNT = 100_000
 MAX_WHOLE_NUMBER = 10**15
 """Largest whole number elsewhere, where it only limits others."""
 
+MAX_ACTION_REPEAT = 10_000
+"""Largest number of steps for which an action is held."""
+
 
 class Checked:
     """Checks of single fields, for frozen dataclasses.

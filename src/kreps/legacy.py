@@ -106,8 +106,9 @@ def checkpoint_settings(stored: Mapping[str, Any], method: str) -> dict[str, Any
     """All settings of a checkpoint of version 0.1, in the flat form."""
     if method != "reps":
         return present_settings(stored)
-    # windows of version 0.1 count rollouts only
-    return {**present_settings({**ADDED_IN_0_1, **stored}), "window_steps": 0}
+    # windows of version 0.1 count rollouts only, and its actions are never held
+    now = present_settings({**ADDED_IN_0_1, **stored})
+    return {**now, "window_steps": 0, "action_repeat": 1}
 
 
 # ---- progress.csv -----------------------------------------------------------------------------

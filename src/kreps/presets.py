@@ -28,6 +28,7 @@ AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
 
 SINGLE_STEP = Settings(
     restart_probability=0.02,
+    action_repeat=1,
     window_steps=0,
     rollout_lengths="independent",
     eta_floor=0.1,

@@ -71,6 +71,7 @@ def references_of(config: RunConfig) -> dict[str, float]:
     # Only this setting is read: a run of an earlier version may have unknown ones.  Where it is
     # chosen, it is that of the references, as their tasks end no episode.
     given = config.settings.get("restart_probability")
-    if given is not None and given != REFERENCE_RESTART_PROBABILITY:
+    held = config.settings.get("action_repeat") not in (None, 1)
+    if held or (given is not None and given != REFERENCE_RESTART_PROBABILITY):
         return {}
     return REFERENCE_REWARDS.get(config.environment, {})

@@ -48,8 +48,9 @@ def evaluate_run(
             rollouts = evaluation_rollouts(
                 learner.env, learner.task, policy, episodes=episodes, steps=steps, seed=seed
             )
-            average = discounted_average(rollouts, learner.restart_probability)
-            episodic = episodic_return(rollouts, steps, limit)
+            repeat = learner.task.action_repeat
+            average = discounted_average(rollouts, learner.restart_probability, repeat)
+            episodic = episodic_return(rollouts, steps, limit, repeat)
             found[name] = replace(average, episodic=episodic)
     return found, rollouts  # of the greedy policy, the last one
 

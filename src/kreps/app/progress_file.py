@@ -4,9 +4,11 @@ eta, its floor, dual, primal and gap are in standard deviations of the reward.  
 number of samples with a weight in the last step of an update, generated ones included.
 ``policy_noise`` is the policy's standard deviation near its data, in units of half the action
 range.  The quartiles are those of the new rollouts' mean rewards per step, each counted by its
-steps.  ``mean_return`` is the mean sum of the rewards of a new rollout, which a random restart may
-have cut, ``terminated`` the share of the new rollouts that ended by a termination.  The errors of
-dynamics, terminations and reward are those of `kreps.models.model_errors`.
+steps.  Steps and rewards per step are those of the environment; the restart probability is that at
+each decision, and ``action_repeat`` the steps for which one is held.  ``mean_return`` is the mean
+sum of the rewards of a new rollout, which a random restart may have cut, ``terminated`` the share
+of the new rollouts that ended by a termination.  The errors of dynamics, terminations and reward
+are those of `kreps.models.model_errors`.
 """
 
 from __future__ import annotations
@@ -66,6 +68,7 @@ ADDED_COLUMNS = (
     "terminated",
     "time_limit",
     "restart_probability",
+    "action_repeat",
 )
 """Columns that runs of earlier versions lack, in the order in which they were added.
 
@@ -110,7 +113,7 @@ COUNT, POSITIVE, NOT_NEGATIVE, SHARE = (1, MAX_WHOLE_NUMBER), (TINY, HUGE), (0, 
 
 WHOLE = {
     **dict.fromkeys(("iteration", "rollouts", "steps", "samples", "support"), COUNT),
-    **dict.fromkeys(("rank", "weighted", "max_rank", "time_limit"), COUNT),
+    **dict.fromkeys(("rank", "weighted", "max_rank", "time_limit", "action_repeat"), COUNT),
     **dict.fromkeys(("newton_iterations", "worst_coordinate"), (0, MAX_WHOLE_NUMBER)),
 }
 """Smallest and largest value of columns of whole numbers."""
@@ -250,5 +253,6 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "terminated": report.terminated,
         "time_limit": episode_limit(learner),
         "restart_probability": report.restart_probability,
+        "action_repeat": learner.task.action_repeat,
         **{seconds_column(stage): round(seconds.get(stage, 0.0), 5) for stage in STAGES},
     }

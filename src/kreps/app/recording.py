@@ -47,7 +47,7 @@ class Recording:
 def record(
     env: Environment, policy: Policy, steps: int, seed: int, *, deterministic: bool
 ) -> Recording:
-    """Let the policy act, and keep a copy of each picture.
+    """Let the policy act, holding its actions as it was learnt, and keep a copy of each picture.
 
     Args:
         env: made with ``render_mode="rgb_array"``.
@@ -60,13 +60,14 @@ def record(
         EnvironmentFailure: the environment raised, or draws no pictures.
     """
     frames, observations, actions = [], [], []
+    held: Any = None
     spaces = spaces_of(env)
     try:
         observation, _ = env.reset(seed=seed)
         for _ in range(steps):
             frames.append(picture_of(env.render()))  # first: without pictures no step is taken
             observations.append(np.array(observation, dtype=np.float64).ravel())
-            action, _ = policy.predict(observations[-1], deterministic=deterministic)
+            action, held = policy.predict(observations[-1], held, deterministic=deterministic)
             actions.append(np.ravel(action))
             observation, _, terminated, truncated, _ = env.step(spaces.actions(actions[-1]))
             if terminated or truncated:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import operator
 from dataclasses import dataclass
+from math import ceil
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 
-from kreps.checks import MAX_WHOLE_NUMBER
+from kreps.checks import MAX_ACTION_REPEAT, MAX_WHOLE_NUMBER
 from kreps.data.spaces import Spaces
 from kreps.errors import ConfigurationError, DataError, NumericalError, shown
 from kreps.intake import as_array, is_sane
@@ -50,6 +51,9 @@ class TaskSpec:
         dt: control period in s; None if it is not known.
         time_limit: steps after which an episode is truncated; None if there is no limit, or none
             that is known.
+        action_repeat: steps of the environment for which an action is held.  What a learner calls a
+            step is then so many of them, with the sum of their rewards.  ``dt`` and ``time_limit``
+            are about single ones.
 
     Raises:
         ConfigurationError: sizes, limits or coordinates that are impossible or contradict each
@@ -65,6 +69,7 @@ class TaskSpec:
     spaces: Spaces | None = None
     dt: float | None = None
     time_limit: int | None = None
+    action_repeat: int = 1
 
     def __post_init__(self) -> None:
         try:
@@ -129,14 +134,18 @@ class TaskSpec:
                 )
             object.__setattr__(self, "dt", float(self.dt))
         if self.time_limit is not None:
-            limit = self.time_limit
-            whole = isinstance(limit, Integral) and not isinstance(limit, bool)
-            if not (whole and 1 <= limit <= MAX_WHOLE_NUMBER):
-                raise ConfigurationError(
-                    f"time_limit = {shown(limit)}, but it must be a whole number of steps from 1 "
-                    f"to {MAX_WHOLE_NUMBER}, or None if there is no limit"
-                )
-            object.__setattr__(self, "time_limit", int(limit))
+            self._check_steps("time_limit", MAX_WHOLE_NUMBER, ", or None if there is no limit")
+        self._check_steps("action_repeat", MAX_ACTION_REPEAT)
+
+    def _check_steps(self, name: str, most: int, otherwise: str = "") -> None:
+        steps = getattr(self, name)
+        whole = isinstance(steps, Integral) and not isinstance(steps, bool)
+        if not (whole and 1 <= steps <= most):
+            raise ConfigurationError(
+                f"{name} = {shown(steps)}, but it must be a whole number of steps from 1 to "
+                f"{most}{otherwise}"
+            )
+        object.__setattr__(self, name, int(steps))
 
     def _check_groups(self) -> None:
         grouped = [i for group in self.groups for i in group]
@@ -202,6 +211,11 @@ class TaskSpec:
     def given_spaces(self) -> Spaces:
         """``spaces``, or those of vectors."""
         return self.spaces or Spaces((self.observation_size,), (self.action_size,))
+
+    @property
+    def decisions(self) -> int | None:
+        """Largest number of decisions in an episode; None without a known time limit."""
+        return None if self.time_limit is None else ceil(self.time_limit / self.action_repeat)
 
     @property
     def action_centre(self) -> FloatArray:

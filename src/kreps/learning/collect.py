@@ -16,6 +16,7 @@ import numpy as np
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.envs.batch import BatchModel, SettableModel
+from kreps.envs.held_actions import held
 from kreps.envs.restart import restart_length, stratified_lengths
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, NumericalError
 from kreps.intake import as_array, as_flag, as_flags, as_number, as_numbers
@@ -59,7 +60,7 @@ def collect(
 
     Args:
         env: without `RandomRestart`: lengths are drawn here.
-        task: of the environment.
+        task: of the environment; each action is held for its ``action_repeat``.
         policy: with its exploration noise.
         count: number of rollouts.
         seed: of the learner.
@@ -76,7 +77,7 @@ def collect(
     """
     seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
     rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
-    limit = time_limit(env)
+    limit = -(-time_limit(env) // task.action_repeat)  # decisions
     if stratified:
         rng = generator(seed, Purpose.RESTART, iteration)
         drawn = stratified_lengths(rng, restart_probability, count)
@@ -201,7 +202,7 @@ def simulate(
 
     Args:
         env: without random restarts.
-        task: of the environment.
+        task: of the environment; each action is held for its ``action_repeat``.
         policy: that acts.
         seeds: (R,) of the environment.
         noises: R times (length, da) standard normal numbers for the policy, in arrays or row by row
@@ -214,6 +215,7 @@ def simulate(
         EnvironmentFailure: the environment raised an exception.
         DataError: it returned NaN, infinities or observations of another size.
     """
+    env = held(env, task.action_repeat)
     model = batch_model_of(env)
     if model is not None:
         rollouts = _simulate_batch(model, task, policy, seeds, noises, longest)

@@ -47,15 +47,19 @@ def evaluated_steps(least: int, limit: int) -> int:
 
 
 @default_errstate()
-def episodic_return(rollouts: Rollouts, steps: int, limit: int) -> EpisodicReturn | None:
+def episodic_return(
+    rollouts: Rollouts, steps: int, limit: int, action_repeat: int = 1
+) -> EpisodicReturn | None:
     """The return of rollouts without restarts; None if the task ended none of them.
 
     Args:
         rollouts: at least one.
-        steps: after which a rollout was cut.
+        steps: of the environment after which a rollout was cut.
         limit: after which the environment truncates; ``sys.maxsize`` without a limit.
+        action_repeat: steps of the environment for each action of the rollouts.  The one in which
+            an episode terminates counts as a whole.
     """
-    lengths = rollouts.lengths
+    lengths = np.minimum(action_repeat * rollouts.lengths, limit)
     whole = rollouts.terminated | (lengths < steps) | (lengths >= limit)
     if not whole.any():
         return None

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import ceil
 
 import numpy as np
 
@@ -41,7 +42,7 @@ class Greedy:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Average reward per step.
+    """Average reward per step of the environment.
 
     Attributes:
         mean: estimated from all rollouts.
@@ -72,13 +73,14 @@ def evaluation_rollouts(
 
     Args:
         env: its random restarts, if it has any, are left out.
-        task: of the environment.
+        task: of the environment; each action is held for its ``action_repeat``.
         policy: that acts.
         episodes: number of rollouts.
-        steps: of each rollout, unless the task ends before.
+        steps: of the environment in each rollout, unless the task ends before.
         seed: of all random numbers.
     """
     inside, _ = without_restarts(env)
+    decisions = ceil(steps / task.action_repeat)
     return simulate(
         inside,
         task,
@@ -86,22 +88,29 @@ def evaluation_rollouts(
         [integer_seed(seed, Purpose.EVALUATION_ENVIRONMENT, j) for j in range(episodes)],
         [
             noise_rows(
-                WHITE, steps, task.action_size, generator(seed, Purpose.EVALUATION_POLICY, j)
+                WHITE, decisions, task.action_size, generator(seed, Purpose.EVALUATION_POLICY, j)
             )
             for j in range(episodes)
         ],
-        longest=longest_rollout([steps] * episodes, task),
+        longest=longest_rollout([decisions] * episodes, task),
     )
 
 
 @default_errstate()
-def discounted_average(rollouts: Sequence[Rollout], restart_probability: float) -> Evaluation:
+def discounted_average(
+    rollouts: Sequence[Rollout], restart_probability: float, action_repeat: int = 1
+) -> Evaluation:
     """The sum of all rewards weighted by ``gamma^t``, divided by the sum of all weights.
 
     This is the average reward per step of the restarting process.  After a termination there is no
     reward until the restart: these steps have the weights ``gamma^T + gamma^(T+1) + ...``, which
     sum to ``gamma^T / (1 - gamma)``.  The mean is the ratio of two sums over rollouts; its standard
     error is that of the delta method.
+
+    Args:
+        rollouts: without restarts.
+        restart_probability: p, at each decision.
+        action_repeat: steps of the environment for each decision, by which the average is divided.
     """
     count = len(rollouts)
     weights = [(1.0 - restart_probability) ** np.arange(len(rollout)) for rollout in rollouts]
@@ -112,7 +121,8 @@ def discounted_average(rollouts: Sequence[Rollout], restart_probability: float) 
     mean = float(gains.sum() / lengths.sum())
     scatter = (gains - mean * lengths) / lengths.mean()
     error = float(scatter.std(ddof=1) / np.sqrt(count)) if count > 1 else 0.0
-    return Evaluation(mean, error, count, max(len(rollout) for rollout in rollouts))
+    longest = action_repeat * max(len(rollout) for rollout in rollouts)
+    return Evaluation(mean / action_repeat, error / action_repeat, count, longest)
 
 
 def stochastic_and_greedy(policy: LearntPolicy) -> dict[str, StochasticPolicy]:
@@ -134,12 +144,12 @@ def evaluate(
 
     Args:
         env: its random restarts, if it has any, are left out.
-        task: of the environment.
+        task: of the environment; each action is held for its ``action_repeat``.
         policy: that acts.
         restart_probability: p of the process.
         episodes: number of rollouts.
-        steps: of each rollout, unless the task ends before.
+        steps: of the environment in each rollout, unless the task ends before.
         seed: of all random numbers.
     """
     rollouts = evaluation_rollouts(env, task, policy, episodes=episodes, steps=steps, seed=seed)
-    return discounted_average(rollouts, restart_probability)
+    return discounted_average(rollouts, restart_probability, task.action_repeat)

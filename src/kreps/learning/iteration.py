@@ -19,7 +19,7 @@ class IterationReport:
     Attributes:
         iteration: number of updates, this one included.
         rollouts, steps: number of rollouts and environment steps so far.
-        average_reward: mean reward per step of the new rollouts.
+        average_reward: mean reward per environment step of the new rollouts.
         mean_return: mean sum of the rewards of a new rollout, which a restart may have cut.
         terminated: share of the new rollouts that ended by a termination.
         reward_quartiles: lower and upper quartile of the new rollouts' mean rewards per step, in

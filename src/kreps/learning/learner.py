@@ -21,6 +21,7 @@ from kreps.data.outliers import find_outliers, warn_of_outliers
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
+from kreps.envs.held_actions import HeldActions, held
 from kreps.errors import ConfigurationError, DataError, enough_memory, shown
 from kreps.kernels.arrays import default_errstate
 from kreps.kernels.threads import blas_threads
@@ -101,13 +102,25 @@ class Learner(Generic[MethodSettings]):
             if probability is not None and settings.get("restart_probability") is None:
                 settings["restart_probability"] = probability
         self.settings = self._settings(settings)
+        repeat = self._action_repeat(chooses=not isinstance(env, TaskSpec))
+        if repeat != self.task.action_repeat:
+            self.task = replace(self.task, action_repeat=repeat)
         if not isinstance(env, TaskSpec):
-            self.env = environment_for(env, self.task, self.settings.restart_probability)
+            self._act_in(env)
         self.threads = None if threads is None else max(1, _whole_number("threads", threads))
         self.state = LearnerState(
             ReplayWindow(self.task, self.settings.window, self.settings.window_steps)
         )
         self._policy: Policy | None = None
+
+    def _action_repeat(self, chooses: bool) -> int:
+        """Steps for which an action is held; ``chooses`` is False if the data are given."""
+        return self.task.action_repeat
+
+    def _act_in(self, env: Environment) -> None:
+        """Collect in this environment from now on."""
+        inside = environment_for(env, self.task, self.settings.restart_probability)
+        self.env = held(inside, self.task.action_repeat)
 
     def _settings(self, changes: dict[str, Any]) -> MethodSettings:
         return changed(self.settings_type(), changes)
@@ -200,20 +213,22 @@ class Learner(Generic[MethodSettings]):
     ) -> Self:
         assert self.env is not None
         for _ in range(iterations):
-            started = time.process_time()
+            started, before = time.process_time(), self.state.steps
             with blas_threads(self.threads, exact=True), enough_memory("collecting rollouts"):
-                rollouts = self._collect(self.env, on_rollout)
+                rollouts, taken = self._collected(self.env, on_rollout)
             seconds = time.process_time() - started
-            probability = self.restart_probability
+            probability, repeat = self.restart_probability, self.task.action_repeat
+            lower, upper = rollouts.reward_quartiles()
             info = self.update(rollouts)
+            self.state = replace(self.state, steps=before + taken)
             report = IterationReport(
                 iteration=self.state.iteration,
                 rollouts=self.state.rollouts,
                 steps=self.state.steps,
-                average_reward=float(rollouts.rewards.mean()),
+                average_reward=float(rollouts.rewards.sum()) / taken,
                 mean_return=float(rollouts.rewards.sum()) / len(rollouts),
                 terminated=float(rollouts.terminated.mean()),
-                reward_quartiles=rollouts.reward_quartiles(),
+                reward_quartiles=(lower / repeat, upper / repeat),
                 update=info,
                 rollout_seconds=seconds,
                 restart_probability=probability,
@@ -249,12 +264,28 @@ class Learner(Generic[MethodSettings]):
         rng = generator(self.seed, Purpose.UPDATE, self.state.iteration)
         with blas_threads(self.threads, exact=True), enough_memory("the update"):
             state, info = self._updated(samples, rng)
+            state = replace(state, steps=self._environment_steps(state))
         storage.require_storable(state)
         self.state = state
         return info
 
     def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:
         return type(self).algorithm(self.state, samples, self.task, self.update_settings, rng)
+
+    def _environment_steps(self, state: LearnerState) -> int:
+        """Steps of the environment after an update whose state counts decisions, fully held."""
+        before = self.state.steps
+        return before + self.task.action_repeat * (state.steps - before)
+
+    def _collected(
+        self, env: Environment, on_rollout: Callable[[int], None] | None
+    ) -> tuple[Rollouts, int]:
+        """The rollouts of the next iteration, and the steps of the environment that they took."""
+        if not isinstance(env, HeldActions):
+            rollouts = self._collect(env, on_rollout)
+            return rollouts, rollouts.steps
+        before = env.steps_taken
+        return self._collect(env, on_rollout), env.steps_taken - before
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
         """The rollouts of the next iteration.
@@ -296,7 +327,7 @@ class Learner(Generic[MethodSettings]):
         state, task, settings, seed = storage.load_checkpoint(path, cls.method, cls.settings_type)
         learner = cls(task, seed=seed, **flat(settings))
         if env is not None:
-            learner.env = environment_for(env, learner.task, settings.restart_probability)
+            learner._act_in(env)
         learner.state = state
         return learner
 

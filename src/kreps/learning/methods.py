@@ -16,6 +16,7 @@ from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError
 from kreps.kernels.basis import LinearFunction
+from kreps.learning import timescale
 from kreps.learning.collect import collect_grid
 from kreps.learning.environment import Environment
 from kreps.learning.learner import Learner, OnPolicyLearner
@@ -63,6 +64,12 @@ class KREPS(OnPolicyLearner[Settings]):
         self._preset = preset
         self.compute = compute or Compute()
         super().__init__(env, seed=seed, periodic=periodic, threads=threads, **settings)
+
+    def _action_repeat(self, chooses: bool) -> int:
+        given = self.settings.action_repeat
+        if given is None and not chooses:
+            return self.task.action_repeat
+        return timescale.action_repeat(self.settings, self.task)
 
     def _settings(self, changes: dict[str, Any]) -> Settings:
         return settings_of(self._preset, **changes)

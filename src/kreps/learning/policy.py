@@ -3,21 +3,35 @@
 from __future__ import annotations
 
 import operator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from kreps.errors import ConfigurationError
-from kreps.intake import as_numbers
-from kreps.kernels.arrays import default_errstate
+from kreps.errors import ConfigurationError, DataError
+from kreps.intake import as_flags, as_numbers
+from kreps.kernels.arrays import FloatArray, IntArray, default_errstate
 from kreps.learning import storage
 from kreps.learning.storage.onnx import write_onnx
 from kreps.policies.base import LearntPolicy
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 from kreps.policies.sparse_gp import SparseGP
 from kreps.seeding import Purpose, generator
+
+
+@dataclass(frozen=True)
+class HeldAction:
+    """What `Policy.predict` returns as state: the actions that are held, and for how much longer.
+
+    Attributes:
+        commanded: (m, da) actions, before clipping.
+        left: (m,) calls in which each is still to be returned.
+    """
+
+    commanded: FloatArray
+    left: IntArray
 
 
 class Policy:
@@ -35,6 +49,11 @@ class Policy:
         self.iteration = iteration
         self._noise = generator(seed, Purpose.PREDICT, iteration)
 
+    @property
+    def action_repeat(self) -> int:
+        """Steps of the environment for which the policy was learnt to hold each action."""
+        return self.process.task.action_repeat
+
     @default_errstate()
     def predict(
         self,
@@ -48,31 +67,66 @@ class Policy:
         Args:
             observation: one as the environment gives it, or several along a first axis; or one or
                 several that are flattened, (ds,) or (m, ds).
-            state, episode_start: accepted for compatibility and not used, as the policy depends on
-                the observation alone.
+            state: what the previous call returned; None decides anew.  With it, an action is
+                held for `action_repeat` steps.
+            episode_start: flag, or (m,) flags, of a new episode, in which nothing is held.
             deterministic: whether to leave out the exploration noise (the mean of a Gaussian
                 process).
 
         Returns:
             Action in the task's units, of the shape and the type of numbers that the environment
-            takes ((da,) of float64 for a `TaskSpec`), or actions along a first axis; and ``state``
-            unchanged.
+            takes ((da,) of float64 for a `TaskSpec`), or actions along a first axis; and the state
+            for the next call, which is ``state`` unchanged where no action is held for longer than
+            a step.
 
         Raises:
-            DataError: another shape, NaN or infinities.
+            DataError: another shape, NaN or infinities, or a state of other calls.
             NumericalError: the action is NaN or infinite; it is not handed out.
         """
         task = self.process.task
         remedy = "no action is defined for it, so check the sensors"
         observations = as_numbers("observations", observation, remedy)
         states, single = task.given_spaces.states(observations)
-        if deterministic:
-            commanded = self.process.greedy(states)
+        if self.action_repeat == 1:
+            commanded = self._decided(states, deterministic)
         else:
-            noise = self._noise.standard_normal((len(states), task.action_size))
-            commanded = self.process.act(states, noise)
+            state = self._held(states, state, episode_start, deterministic)
+            commanded = state.commanded
         applied = task.clip(commanded)
         return task.given_spaces.actions(applied[0] if single else applied), state
+
+    def _decided(self, states: FloatArray, deterministic: bool) -> FloatArray:
+        """Commanded actions (m, da) in states (m, ds)."""
+        if deterministic:
+            return self.process.greedy(states)
+        noise = self._noise.standard_normal((len(states), self.process.task.action_size))
+        return self.process.act(states, noise)
+
+    def _held(
+        self, states: FloatArray, state: Any, episode_start: Any, deterministic: bool
+    ) -> HeldAction:
+        """The actions of a call in states (m, ds): held ones, and new ones where none is left."""
+        count, width = len(states), self.process.task.action_size
+        if state is None:
+            state = HeldAction(np.zeros((count, width)), np.zeros(count, np.intp))
+        if not isinstance(state, HeldAction) or state.commanded.shape != (count, width):
+            raise DataError(
+                f"state = {state!r:.60}, but what predict returned for as many observations before "
+                "is needed; pass None at the start"
+            )
+        started = False if episode_start is None else as_flags("episode_start", episode_start)
+        try:
+            new = np.broadcast_to(started, count) | (state.left == 0)
+        except ValueError as error:
+            raise DataError(
+                f"episode_start has shape {np.shape(episode_start)}, but a flag for each of "
+                f"{count} observations is needed"
+            ) from error
+        commanded, left = state.commanded.copy(), state.left.copy()
+        if new.any():
+            commanded[new] = self._decided(states[new], deterministic)
+            left[new] = self.action_repeat
+        return HeldAction(commanded, left - 1)
 
     def save(self, path: str | Path) -> None:
         """Write the policy to a file; read it with `kreps.load_policy`."""
@@ -124,9 +178,10 @@ class Policy:
 
         Its input is ``observation`` (batch, ds).  Its outputs are ``action`` (batch, da), the mean
         clipped to the task's limits, and ``standard_deviation`` (batch, da) of the commanded
-        action, both in the task's units.  If an observation or a result is NaN or infinite, the
-        model ends with an error in place of an action.  `kreps.check_file` tells whether a copy of
-        the model is undamaged.
+        action, both in the task's units.  The metadata have ``action_repeat``, the control periods
+        (of ``dt`` in s) for which the controller has to hold an action.  If an observation or a
+        result is NaN or infinite, the model ends with an error in place of an action.
+        `kreps.check_file` tells whether a copy of the model is undamaged.
 
         Args:
             path: such as ``policy.onnx``; the folder must exist.

@@ -1,12 +1,17 @@
-"""The time scale of learning where the settings leave it open: how long rollouts are.
+"""The time scale of learning where the settings leave it open: how long rollouts are, and how
+often a policy decides.
 
 docs/decisions/0020-time-that-fits-the-task.md has the reasons and what was measured.
 """
 
 from __future__ import annotations
 
+from kreps.checks import MAX_ACTION_REPEAT
 from kreps.data.task import TaskSpec
-from kreps.settings import USUAL_RESTART_PROBABILITY, LearnerSettings
+from kreps.settings import USUAL_RESTART_PROBABILITY, LearnerSettings, Settings
+
+DECISION_PERIOD = 0.04
+"""Seconds for which an action is held, where that can be chosen: 25 decisions per second."""
 
 LENGTHS = 50, 200
 """Smallest and largest number of steps of a rollout that is chosen, on average."""
@@ -16,20 +21,32 @@ ENDING = 0.005
 happen late in an episode."""
 
 
+def action_repeat(settings: Settings, task: TaskSpec) -> int:
+    """Steps for which an action is held: those of the settings, or about 0.04 s.
+
+    1 where the control period is not known.
+    """
+    if settings.action_repeat is not None:
+        return settings.action_repeat
+    if task.dt is None:
+        return 1
+    return min(max(round(DECISION_PERIOD / task.dt), 1), MAX_ACTION_REPEAT)
+
+
 def restart_probability(settings: LearnerSettings, task: TaskSpec, terminated: bool) -> float:
-    """p: that of the settings, or ``1 / clip(T, 50, 200)`` for episodes of at most T steps.
+    """p: that of the settings, or ``1 / clip(T, 50, 200)`` for episodes of at most T decisions.
 
     Without a known time limit it is 0.02, as in the paper, until an episode has terminated, and
     0.005 from then on.
 
     Args:
         settings: of the learner.
-        task: whose ``time_limit`` is T.
+        task: with T, its ``time_limit`` over its ``action_repeat``.
         terminated: whether any episode so far ended by a termination.
     """
     if settings.restart_probability is not None:
         return settings.restart_probability
-    if task.time_limit is None:
+    if task.decisions is None:
         return ENDING if terminated else USUAL_RESTART_PROBABILITY
     least, most = LENGTHS
-    return 1.0 / min(max(task.time_limit, least), most)
+    return 1.0 / min(max(task.decisions, least), most)

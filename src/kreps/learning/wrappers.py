@@ -8,6 +8,7 @@ from typing import Any
 
 import gymnasium as gym
 
+from kreps.envs.held_actions import HeldActions
 from kreps.envs.restart import RandomRestart
 from kreps.errors import ConfigurationError
 
@@ -51,7 +52,7 @@ def keeps_observations(wrapper: Wrapper) -> bool:
     if name in KEEPS_ORDER:
         return isinstance(wrapper.env.observation_space, gym.spaces.Box)
     return (
-        isinstance(wrapper, RandomRestart)
+        isinstance(wrapper, RandomRestart | HeldActions)
         or name in KEEPS_OBSERVATIONS
         or _inherits(wrapper, gym.ActionWrapper, gym.RewardWrapper)
     )
@@ -60,7 +61,7 @@ def keeps_observations(wrapper: Wrapper) -> bool:
 def keeps_actions(wrapper: Wrapper) -> bool:
     """Whether a wrapper certainly leaves the coordinates of actions and their units as they are."""
     return (
-        isinstance(wrapper, RandomRestart)
+        isinstance(wrapper, RandomRestart | HeldActions)
         or _gymnasium_name(wrapper) in KEEPS_ACTIONS
         or _inherits(wrapper, gym.ObservationWrapper, gym.RewardWrapper)
     )

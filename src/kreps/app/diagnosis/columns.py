@@ -74,6 +74,12 @@ def rollout_lengths(rows: Sequence[Row]) -> FloatArray:
     return np.diff(steps, prepend=0.0) / np.maximum(np.diff(rollouts, prepend=0.0), 1.0)
 
 
+def action_repeats(rows: Sequence[Row]) -> FloatArray:
+    """Steps for which an action was held, 1 in runs of versions that could not hold it: (m,)."""
+    found = column(rows, "action_repeat")
+    return np.where(np.isfinite(found), found, 1.0)
+
+
 def ends_episodes(rows: Sequence[Row]) -> bool:
     """Whether the task ends episodes: by a time limit, or by terminations that were observed."""
     return bool(np.isfinite(latest(rows, "time_limit")) or (column(rows, "terminated") > 0.0).any())
@@ -91,7 +97,8 @@ def average_rewards(rows: Sequence[Row]) -> FloatArray:
     terminations it is the column ``average_reward``.
     """
     rewards, ended = column(rows, "average_reward"), column(rows, "terminated")
-    probability, steps = column(rows, "restart_probability"), rollout_lengths(rows)
+    probability = column(rows, "restart_probability") / action_repeats(rows)
+    steps = rollout_lengths(rows)
     known = (ended > 0.0) & (probability > 0.0) & (steps > 0.0)
     waiting = np.where(known, ended, 0.0) / np.where(known, probability * steps, 1.0)
     return rewards / (1.0 + waiting)

@@ -9,6 +9,7 @@ import numpy as np
 
 from kreps.app.diagnosis.columns import (
     Row,
+    action_repeats,
     latest,
     recent,
     recent_length,
@@ -78,7 +79,9 @@ def rollout_length(rows: Sequence[Row], greedy: Rollouts | None) -> Finding | No
     """
     name = "rollout length"
     length, limit = recent_length(rows), latest(rows, "time_limit")
-    rise, allowed = late_rise(greedy, int(length)), LATE_RISE_NOTE * reward_range(rows)
+    repeat = action_repeats(rows)[-1]
+    rise = late_rise(greedy, int(length / repeat)) / repeat
+    allowed = LATE_RISE_NOTE * reward_range(rows)
     measured = f"Rollouts have {length:.4g} steps on average"
     if rise > allowed > 0.0:
         return Finding(
@@ -129,5 +132,6 @@ def late_rise(greedy: Rollouts | None, length: int) -> float:
 def longer_rollouts(rows: Sequence[Row]) -> str:
     """Rollouts of half the time limit, or twice as long as they are."""
     longer = np.fmax(0.5 * latest(rows, "time_limit"), 2.0 * recent_length(rows))
-    probability = float(f"{1.0 / max(longer, 2.0):.2g}")
+    decisions = longer / action_repeats(rows)[-1]
+    probability = float(f"{1.0 / max(decisions, 2.0):.2g}")
     return f"a new run with longer rollouts (--set restart_probability={probability:g})."

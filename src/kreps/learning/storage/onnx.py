@@ -121,6 +121,8 @@ def _note(policy: SparseGP, arithmetic: str) -> str:
         "action_low": task.action_low.tolist(),
         "action_high": task.action_high.tolist(),
         "periodic": list(task.periodic),
+        "action_repeat": task.action_repeat,
+        "dt": task.dt,
         "image_shape": None if task.image_shape is None else list(task.image_shape),
     }
     return json.dumps(content, sort_keys=True)

@@ -58,8 +58,9 @@ TASK = Record(
         ),
         "dt": Plain(),
         "time_limit": Plain(),
+        "action_repeat": Plain(),
     },
-    absent={"spaces": None, "dt": None, "time_limit": None},
+    absent={"spaces": None, "dt": None, "time_limit": None, "action_repeat": 1},
 )
 
 LENGTHSCALES = Limit("between 1e-100 and 1e100", lambda v: (v > 1e-100) & (v < 1e100))
