@@ -14,7 +14,7 @@ import pytest
 import kreps
 from kreps.errors import ConfigurationError
 from kreps.learning.environment import task_of, time_limit
-from kreps.learning.timescale import restart_probability
+from kreps.learning.timescale import choices, restart_probability
 from kreps.presets import settings_of
 from kreps.settings import Settings
 
@@ -212,6 +212,50 @@ def test_a_termination_is_remembered_when_its_rollout_is_forgotten() -> None:
         found.append(learner.restart_probability)
     assert found == [0.02, 0.005, 0.005]
     assert not learner.state.window.rollouts.terminated.all()
+
+
+# ---- what is said -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("task", "terminated", "line"),
+    [
+        ({}, False, ""),
+        ({}, True, "rollouts of 200 steps on average (an episode has terminated)"),
+        ({"time_limit": 80}, True, "rollouts of 80 steps on average (time limit 80 steps)"),
+        (
+            {"dt": 0.01, "action_repeat": 4, "time_limit": 1000},
+            False,
+            "actions held 4 steps (control period 0.01 s), rollouts of 200 decisions on average "
+            "(time limit 1000 steps)",
+        ),
+        ({"dt": 0.01, "action_repeat": 4}, False, "actions held 4 steps (control period 0.01 s)"),
+        ({"action_repeat": 4}, False, "actions held 4 steps"),
+    ],
+)
+def test_a_line_says_what_was_chosen_and_why(
+    task: dict[str, Any], terminated: bool, line: str
+) -> None:
+    assert choices(settings_of(), kreps.TaskSpec(1, [-1.0], [1.0], **task), terminated) == line
+
+
+def test_nothing_is_said_of_what_was_given() -> None:
+    task = kreps.TaskSpec(1, [-1.0], [1.0], dt=0.01, action_repeat=4, time_limit=1000)
+    assert choices(settings_of(restart_probability=0.1, action_repeat=4), task, True) == ""
+    assert choices(settings_of("paper"), task, True) == ""
+    assert choices(kreps.NPALP(task).settings, task, True) == ""
+
+
+def test_the_progress_begins_with_that_line(capsys: pytest.CaptureFixture[str]) -> None:
+    kreps.KREPS(gym.wrappers.TimeLimit(Line(dt=0.02), 120), **SMALL).learn(1)
+    first, second, *_ = capsys.readouterr().out.splitlines()
+    assert first == (
+        "actions held 2 steps (control period 0.02 s), rollouts of 60 decisions on average (time "
+        "limit 120 steps)"
+    )
+    assert second.startswith("iter 1 ")
+    kreps.KREPS(Line(), **SMALL).learn(1)
+    assert capsys.readouterr().out.startswith("iter 1 ")
 
 
 # ---- files ------------------------------------------------------------------------------------

@@ -202,6 +202,7 @@ class Learner(Generic[MethodSettings]):
             from kreps.learning.progress import ProgressTable
 
             with ProgressTable(self.state.iteration + iterations) as table:
+                table.say(timescale.choices(self.settings, self.task, self.state.terminated))
                 return self._learn(iterations, [*callbacks, table], table.rollouts_done)
         return self._learn(iterations, callbacks, None)
 

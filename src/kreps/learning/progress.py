@@ -102,6 +102,15 @@ class ProgressTable:
         elif self._stages:
             self._print_line(self._stage_line())
 
+    def say(self, line: str) -> None:
+        """Print a line above the table, unless it is empty."""
+        if not line:
+            return
+        if self._console.is_terminal:
+            self._console.print(Text(line), soft_wrap=True)
+        else:
+            self._print_line(line)
+
     def rollouts_done(self, count: int) -> None:
         """Show how many rollouts of the iteration are complete."""
         self._bar.update(self._task, note=f"{count} rollouts")

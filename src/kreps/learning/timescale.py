@@ -50,3 +50,19 @@ def restart_probability(settings: LearnerSettings, task: TaskSpec, terminated: b
         return ENDING if terminated else USUAL_RESTART_PROBABILITY
     least, most = LENGTHS
     return 1.0 / min(max(task.decisions, least), most)
+
+
+def choices(settings: LearnerSettings, task: TaskSpec, terminated: bool) -> str:
+    """A line that says what was chosen and why; empty where all is as in the paper, or given."""
+    repeat, said = task.action_repeat, []
+    if repeat > 1 and getattr(settings, "action_repeat", repeat) is None:
+        period = "" if task.dt is None else f" (control period {task.dt:g} s)"
+        said.append(f"actions held {repeat} steps{period}")
+    if settings.restart_probability is None:
+        unit = "steps" if repeat == 1 else "decisions"
+        length = f"rollouts of {1.0 / restart_probability(settings, task, terminated):.0f} {unit}"
+        if task.time_limit is not None:
+            said.append(f"{length} on average (time limit {task.time_limit} steps)")
+        elif terminated:
+            said.append(f"{length} on average (an episode has terminated)")
+    return ", ".join(said)
