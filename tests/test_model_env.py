@@ -13,7 +13,13 @@ from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Kernel
 from kreps.models.dynamics import DeltaStateTargets, Dynamics, LinearMean, fit_dynamics
-from kreps.models.model_env import ModelEnv, average_reward, supports_model_rollouts
+from kreps.models.model_env import (
+    MAX_EVALUATION_STEPS,
+    ModelEnv,
+    ModelRollouts,
+    average_reward,
+    supports_model_rollouts,
+)
 from kreps.models.terminations import Terminations
 from kreps.models.transition import state_kernel
 
@@ -210,7 +216,9 @@ def test_model_rollouts_need_ten_samples_per_coefficient(steps: int, supported: 
 
 
 def test_there_are_no_model_rollouts_in_images() -> None:
-    image = TaskSpec(4, [-1.0], [1.0], groups=((0, 1, 2, 3),), image_shape=(2, 2))
+    image = TaskSpec(
+        4, np.array([-1.0]), np.array([1.0]), groups=((0, 1, 2, 3),), image_shape=(2, 2)
+    )
     data = Transitions.from_rollouts(
         [Rollout(np.zeros((5000, 4)), np.zeros((4999, 1)), np.zeros(4999))]
     )
@@ -233,7 +241,7 @@ def average_rewards(
     smallest: float = -9.0,
     typical: float = 1.0,
 ) -> FloatArray:
-    (rollouts,) = env.evaluate([policy], reward, count, np.random.default_rng(0))
+    rollouts = env.evaluate(policy, reward, count, np.random.default_rng(0))
     rewards = rollouts.pessimistic_rewards(smallest, typical)
     return average_reward(rewards, env.restart_probability)
 
@@ -254,9 +262,18 @@ def test_an_evaluation_has_two_mean_lengths_up_to_the_longest_rollout(
 ) -> None:
     policy = Push()
     env = model_env(restart_probability=p, max_steps=max_steps)
-    (rollouts,) = env.evaluate([policy], angle, 4, np.random.default_rng(0))
+    rollouts = env.evaluate(policy, angle, 4, np.random.default_rng(0))
     assert len(policy.steps) == steps
     assert rollouts.rewards.shape == rollouts.similarity.shape == (steps, 4)
+
+
+@pytest.mark.parametrize(("p", "steps"), [(0.0125, 160), (0.01, 200), (1e-3, 200)])
+def test_an_evaluation_has_at_most_two_hundred_steps(p: float, steps: int) -> None:
+    policy = Push()
+    env = model_env(restart_probability=p, max_steps=5000)
+    rollouts = env.evaluate(policy, angle, 2, np.random.default_rng(0))
+    assert MAX_EVALUATION_STEPS == 200
+    assert len(policy.steps) == len(rollouts.rewards) == steps
 
 
 def test_rewards_are_those_of_the_applied_actions() -> None:
@@ -271,37 +288,42 @@ def test_after_a_termination_nothing_more_is_earned() -> None:
         return 1.0 + 5.0 * terminations
 
     env = model_env(termination=1.0, end_reward=-2.0)
-    (found,) = env.evaluate([Push()], reward, 30, np.random.default_rng(0))
+    found = env.evaluate(Push(), reward, 30, np.random.default_rng(0))
     np.testing.assert_array_equal(found.rewards[0], np.full(30, 6.0))
     np.testing.assert_array_equal(found.rewards[1:], np.full((19, 30), -2.0))
     assert not found.ended[0].any() and found.ended[1:].all()
 
     env = model_env(termination=0.25, end_reward=-2.0, max_steps=20)
-    (found,) = env.evaluate([Push()], reward, 4000, np.random.default_rng(0))
+    found = env.evaluate(Push(), reward, 4000, np.random.default_rng(0))
     shares = 1.0 - found.ended.mean(axis=1)
     np.testing.assert_allclose(shares, 0.75 ** np.arange(20), atol=0.03)
     np.testing.assert_array_equal(found.rewards, np.where(found.ended, -2.0, 2.25))
 
 
 def test_without_a_termination_no_rollout_ends() -> None:
-    (found,) = model_env(end_reward=-2.0).evaluate([Push()], angle, 30, np.random.default_rng(0))
+    found = model_env(end_reward=-2.0).evaluate(Push(), angle, 30, np.random.default_rng(0))
     assert not found.ended.any()
 
 
-def test_policies_are_compared_with_common_random_numbers() -> None:
-    """Where terminations do not depend on the policy, each is evaluated as it would be alone."""
+def test_rollouts_from_one_seed_have_common_random_numbers() -> None:
     env = model_env(loo_residuals=1e-2, termination=0.3, exploring_starts=0.5)
-    forces = (-1.0, 0.0, 1.0)
-    together = env.evaluate([*map(Push, forces)], angle, 20, np.random.default_rng(0))
-    for force, found in zip(forces, together, strict=True):
-        (alone,) = env.evaluate([Push(force)], angle, 20, np.random.default_rng(0))
-        np.testing.assert_array_equal(found.ended, alone.ended)
-        np.testing.assert_allclose(found.rewards, alone.rewards)
-        np.testing.assert_allclose(found.similarity, alone.similarity)
-    assert 0 < together[0].ended.sum() < together[0].ended.size
-    assert not np.allclose(together[0].rewards, together[2].rewards)
-    (other,) = env.evaluate([Push(0.0)], angle, 20, np.random.default_rng(1))
-    assert not np.allclose(other.rewards, together[1].rewards)
+
+    def found(force: float, seed: int = 0) -> tuple[ModelRollouts, FloatArray]:
+        policy = Push(force)
+        rollouts = env.evaluate(policy, angle, 20, np.random.default_rng(seed))
+        return rollouts, policy.steps[0]
+
+    (one, starts), (again, _), (other, other_starts) = found(-1.0), found(-1.0), found(1.0)
+    np.testing.assert_array_equal(again.rewards, one.rewards)
+    np.testing.assert_array_equal(again.similarity, one.similarity)
+    np.testing.assert_array_equal(again.ended, one.ended)
+    # another policy has the same starts, and ends where ends do not depend on it
+    np.testing.assert_array_equal(other_starts, starts)
+    np.testing.assert_array_equal(other.ended, one.ended)
+    assert 0 < one.ended.sum() < one.ended.size
+    assert not np.allclose(other.rewards, one.rewards)
+    with_other_numbers, _ = found(-1.0, seed=1)
+    assert not np.allclose(with_other_numbers.rewards, one.rewards)
 
 
 def test_rewards_far_from_the_samples_are_shrunk_towards_the_smallest() -> None:

@@ -14,20 +14,26 @@ import kreps
 from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.kernel import Kernel
+from kreps.kernels.kernel import Kernel, SquaredExponential
+from kreps.learning.collect import collect
 from kreps.models.model_env import ModelRollouts
-from kreps.models.novelty import NoveltyBonus, novelty_bonus, novelty_radius
+from kreps.models.novelty import MAX_RADIUS, NoveltyBonus, novelty_bonus, novelty_radius
 from kreps.models.reward_model import RewardModel
 from kreps.models.world_model import WorldModel
+from kreps.policies.base import StochasticPolicy
 
 TASK = TaskSpec(2, np.array([-1.0]), np.array([1.0]))
 KERNEL = Kernel(TASK.state_factors, np.array([0.5, 2.0]))
 
+LIMIT = 2.0 * MAX_RADIUS
+"""Largest radius with this kernel, which has two factors."""
 
-def rollouts(count: int, seed: int = 0) -> list[Rollout]:
+
+def rollouts(count: int, seed: int = 0, spread: float = 0.2) -> list[Rollout]:
+    """Random states, near enough to each other for a radius below its limit."""
     rng = np.random.default_rng(seed)
     return [
-        Rollout(rng.standard_normal((n + 1, 2)), np.zeros((n, 1)), rng.standard_normal(n))
+        Rollout(spread * rng.standard_normal((n + 1, 2)), np.zeros((n, 1)), rng.standard_normal(n))
         for n in rng.integers(3, 9, count)
     ]
 
@@ -45,17 +51,58 @@ def half_squared_distance(a: FloatArray, b: FloatArray) -> float:
 # ---- the radius -------------------------------------------------------------------------------
 
 
-def test_nine_in_ten_samples_have_one_of_another_rollout_within_the_radius() -> None:
+@pytest.mark.parametrize("share", [0.9, 0.5])
+def test_a_share_of_the_samples_has_one_of_another_rollout_within_the_radius(share: float) -> None:
     made = rollouts(6)
     nearest = [
         min(half_squared_distance(s, t) for o in made if o is not r for t in o.observations[:-1])
         for r in made
         for s in r.observations[:-1]
     ]
-    found = novelty_radius(model_env(made))
+    env = model_env(made)
+    found = novelty_radius(env, share=share)
+    assert found is not None and found < LIMIT
     similarity = np.exp(-np.array(nearest))
-    assert found == pytest.approx(-np.log(np.quantile(similarity, 0.1)), rel=1e-9)
-    assert np.mean(np.array(nearest) <= found) == pytest.approx(0.9, abs=0.03)
+    assert found == pytest.approx(-np.log(np.quantile(similarity, 1.0 - share)), rel=1e-9)
+    assert np.mean(np.array(nearest) <= found) == pytest.approx(share, abs=0.03)
+    if share == 0.9:
+        assert found == novelty_radius(env)  # the default
+
+
+def test_the_radius_has_an_upper_limit_per_factor_of_the_kernel() -> None:
+    made = rollouts(6, spread=2.0)
+    assert novelty_radius(model_env(made)) == novelty_radius(model_env(made), 0.5) == LIMIT
+    # one factor for both coordinates, and a factor for each of three
+    env: Any = SimpleNamespace(
+        data=model_env(made).data, kernel=Kernel((SquaredExponential((0, 1)),), np.array([0.1]))
+    )
+    assert novelty_radius(env) == 0.06
+    states = np.random.default_rng(0).normal(size=(10, 3))
+    apart = [Rollout(100.0 * s + np.zeros((4, 3)), np.zeros((3, 1)), np.zeros(3)) for s in states]
+    kernel = Kernel(TaskSpec(3, np.array([-1.0]), np.array([1.0])).state_factors, np.ones(3))
+    env = SimpleNamespace(data=Transitions.from_rollouts(apart), kernel=kernel)
+    assert novelty_radius(env) == pytest.approx(0.18)
+
+
+def test_one_far_rollout_does_not_make_every_state_explored(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # two rollouts near the start, and a third one that goes far away
+    near = rollouts(2, spread=0.01)
+    away = np.stack([np.linspace(0.0, 4.0, 8), np.linspace(0.0, 4.0, 8)], axis=1)
+    far = Rollout(away, np.zeros((7, 1)), np.zeros(7))
+    env = model_env([*near, far])
+    found = novelty_radius(env)
+    assert found == LIMIT
+    similarity = env.kernel.gram(np.array([[-2.0, -2.0], [0.0, 0.0]]), env.data.states)
+    novelty = NoveltyBonus(1.0, 0.0, found).novelty(similarity.max(axis=1))
+    assert novelty[0] > 0.99 and novelty[1] == 0.0
+    # without the limit, a state on the other side of the start would count as explored
+    monkeypatch.setattr("kreps.models.novelty.MAX_RADIUS", np.inf)
+    unlimited = novelty_radius(env)
+    assert unlimited is not None
+    novelty = NoveltyBonus(1.0, 0.0, unlimited).novelty(similarity.max(axis=1))
+    assert novelty.tolist() == [0.0, 0.0]
 
 
 def test_a_subsample_keeps_its_rollout_numbers() -> None:
@@ -87,7 +134,7 @@ def test_the_radius_does_not_depend_on_the_size_of_the_blocks() -> None:
 def test_one_rollout_alone_gives_no_radius_and_no_bonus() -> None:
     env = model_env(rollouts(1))
     assert novelty_radius(env) is None
-    assert novelty_bonus(env, np.arange(3.0), np.ones(3) / 3, initial=0.1, updates=0) is None
+    assert novelty_bonus(env, np.arange(3.0), np.ones(3) / 3, initial=0.1, rollouts=0.0) is None
 
 
 def test_equal_states_give_a_positive_radius() -> None:
@@ -132,18 +179,40 @@ def test_an_unexplored_region_is_absorbing_in_model_rollouts() -> None:
     np.testing.assert_allclose(found, [*wanted[:2], [4.0, 6.0], [6.0, 7.0]], rtol=1e-12)
 
 
-def test_the_bonus_decays_with_each_update_until_it_is_left_out() -> None:
-    env = model_env(rollouts(5))
+def strength(initial: float, rollouts_seen: float) -> float:
+    """Of the bonus, as a share of the way from the average reward to the best one; 0 for none."""
+    env, rewards, weights = model_env(rollouts(5)), np.arange(9.0), np.eye(9)[2]
+    bonus = novelty_bonus(env, rewards, weights, initial, rollouts_seen)
+    if bonus is None:
+        return 0.0
+    assert bonus.average_reward == 2.0
+    return (bonus.optimistic_reward - 2.0) / (8.0 - 2.0)
+
+
+def test_the_bonus_is_as_set_after_thirty_rollouts_and_larger_before() -> None:
+    assert strength(0.1, 30.0) == pytest.approx(0.1)
+    assert strength(0.1, 40.0) == pytest.approx(0.035)
+    assert strength(0.1, 20.0) == pytest.approx(0.1 / 0.35)
+    assert strength(0.1, 35.0) == pytest.approx(0.1 * 0.35**0.5)  # not in steps of ten
+    # R-max while there are few data
+    assert strength(0.1, 3.0) == strength(0.1, 0.0) == pytest.approx(1.0)
+    # a bonus beyond the best reward does not grow further
+    assert strength(2.0, 3.0) == strength(2.0, 30.0) == pytest.approx(2.0)
+    assert strength(2.0, 40.0) == pytest.approx(0.7)
+
+
+def test_the_bonus_decays_with_the_data_until_it_is_left_out() -> None:
+    found = [strength(0.5, 30.0 + 10.0 * tens) for tens in range(6)]
+    np.testing.assert_allclose(found[:5], 0.5 * 0.35 ** np.arange(5))
+    assert found[4] >= 0.005 > 0.35 * found[4]
+    assert found[5] == strength(0.5, 1e6) == 0.0
+
+
+@pytest.mark.parametrize("rollouts_seen", [0.0, 30.0])
+def test_there_is_no_bonus_without_a_model_or_if_it_is_switched_off(rollouts_seen: float) -> None:
     rewards, weights = np.arange(9.0), np.eye(9)[2]
-    optimistic: list[float] = []
-    while (bonus := novelty_bonus(env, rewards, weights, 0.5, len(optimistic))) is not None:
-        assert bonus.average_reward == 2.0
-        optimistic.append(bonus.optimistic_reward)
-    strengths = (np.array(optimistic) - 2.0) / (8.0 - 2.0)
-    np.testing.assert_allclose(strengths, 0.5 * 0.35 ** np.arange(5))
-    assert strengths[-1] >= 0.005 > 0.35 * strengths[-1]
-    assert novelty_bonus(None, rewards, weights, 0.5, 0) is None
-    assert novelty_bonus(env, rewards, weights, 0.0, 0) is None
+    assert novelty_bonus(None, rewards, weights, 0.5, rollouts_seen) is None
+    assert strength(0.0, rollouts_seen) == 0.0
 
 
 def test_the_optimistic_reward_is_never_below_the_average() -> None:
@@ -194,7 +263,7 @@ def test_novelty_is_that_of_the_successor_unless_the_task_terminates() -> None:
         np.testing.assert_array_equal(states, np.full((4, 2), 2.0))
         return None, similarity
 
-    env = SimpleNamespace(
+    env: Any = SimpleNamespace(
         dynamics=SimpleNamespace(
             predict=lambda inputs: (inputs[:, :2] + 1.0, termination), terminations=object()
         ),
@@ -228,21 +297,36 @@ def test_expected_rewards_are_the_mean_plus_the_model_clipped_to_the_observed_ra
     np.testing.assert_allclose(found, np.clip(predicted + 0.8 * probabilities, -3.0, 0.0))
 
 
-def angle_of_the_highest_eighth(bonus: float) -> float:
-    """The angle from the top within which an eighth of the states of the second batch are."""
-    learner = kreps.KREPS(
-        gym.make("kreps/SwingUp-v0"),
-        seed=248,
-        exploration=kreps.Exploration("gaussian"),
-        **{"model_based.exploration_bonus": bonus},
+def swing_up(bonus: float) -> kreps.KREPS:
+    """After the first update, from three mean rollouts of white noise."""
+    settings: dict[str, Any] = {
+        "exploration": kreps.Exploration("gaussian"),
+        "model_based.exploration_bonus": bonus,
+        "model_based.improvement_steps": 3,
+    }
+    learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=248, **settings)
+    return learner.learn(1, progress=False)
+
+
+def angle_of_the_highest_eighth(learner: kreps.KREPS, policy: StochasticPolicy | None) -> float:
+    """The angle from the top within which an eighth of the states of a policy's rollouts are."""
+    assert policy is not None and learner.env is not None
+    made = collect(
+        learner.env, learner.task, policy, 10, seed=0, iteration=1, restart_probability=0.02
     )
-    learner.learn(2, progress=False)
-    newest = learner.state.window.rollouts[-10:]
-    angles = np.abs(np.concatenate([rollout.observations[:, 0] for rollout in newest]))
+    angles = np.abs(np.concatenate([rollout.observations[:, 0] for rollout in made]))
     return float(np.quantile(angles, 0.125))
 
 
-def test_with_a_bonus_a_policy_explores_what_white_noise_did_not() -> None:
-    # white noise does not reach the top; without a bonus the policy holds the local optimum
-    assert angle_of_the_highest_eighth(0.0) > 1.6
-    assert angle_of_the_highest_eighth(0.1) < 1.4
+def test_with_a_bonus_an_explorer_reaches_what_white_noise_did_not() -> None:
+    learner = swing_up(0.1)
+    seen = np.concatenate([r.observations[:, 0] for r in learner.state.window.rollouts])
+    assert np.abs(seen).min() > 1.4  # white noise does not reach the top
+    # the acting policy holds the local optimum, as it has no bonus
+    assert angle_of_the_highest_eighth(learner, learner.state.policy) > 1.5
+    assert angle_of_the_highest_eighth(learner, learner.state.explorer) < 1.0
+
+
+def test_without_a_bonus_there_is_no_explorer() -> None:
+    learner = swing_up(0.0)
+    assert learner.state.policy is not None and learner.state.explorer is None

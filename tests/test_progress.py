@@ -45,6 +45,7 @@ def report(iteration: int) -> Any:
         mean_return=-6.17e-5,
         update=Update(),
         rollout_seconds=0.1,
+        explorer_share=0.0,
     )
 
 

@@ -19,7 +19,12 @@ import kreps
 from kreps.app.run_folder import RunConfig, RunFolder
 from kreps.learning.iteration import IterationReport
 
-TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
+TINY: dict[str, Any] = {
+    "initial_rollouts": 6,
+    "rollouts_per_iteration": 3,
+    "growth": 0.0,
+    "window": 6,
+}
 NAME = "kreps/SwingUp-v0"
 COMMAND = [sys.executable, "-m", "kreps"]
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]

@@ -167,9 +167,10 @@ def test_collecting_in_batches_and_step_by_step_gives_the_same_data() -> None:
 
 def test_lengths_are_stratified_by_the_settings() -> None:
     def steps(**settings: Any) -> list[int]:
-        learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=3, initial_rollouts=30, **settings)
+        settings = {"initial_rollouts": 30, "growth": 0.0, **settings}
+        learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=3, **settings)
         assert learner.env is not None
-        return [len(rollout) for rollout in learner._collect(learner.env, None)]
+        return [len(rollout) for rollout in learner._collect(learner.env, None).rollouts]
 
     lengths = steps()
     assert lengths == stratified_lengths(generator(3, Purpose.RESTART, 0), 0.02, 30)
@@ -321,11 +322,12 @@ def test_rollouts_that_only_the_environment_ends_need_no_memory_for_more(
 def test_rollouts_that_nothing_ends_are_an_error_with_the_remedy(
     env: gym.Env[Any, Any], probability: float
 ) -> None:
-    learner = kreps.KREPS(env, seed=0, restart_probability=probability, initial_rollouts=3)
+    settings: dict[str, Any] = {"restart_probability": probability, "growth": 0.0}
+    learner = kreps.KREPS(env, seed=0, initial_rollouts=3, **settings)
     with pytest.raises(ConfigurationError, match=r"more than 10000 steps.*TimeLimit"):
         learner.learn(1, progress=False)
     limited = gym.wrappers.TimeLimit(env, 20)
-    again = kreps.KREPS(limited, seed=0, restart_probability=probability, initial_rollouts=3)
+    again = kreps.KREPS(limited, seed=0, initial_rollouts=3, **settings)
     assert again.learn(1, progress=False).state.steps == 60
 
 

@@ -32,8 +32,9 @@ MODEL_BASED: dict[str, Any] = {
     "window_steps": 1000,
     "exploration.noise": "bang-bang",
     "exploration.scale": 1.0,
-    "initial_rollouts": 30,
+    "initial_rollouts": 3,
     "rollouts_per_iteration": 10,
+    "growth": 0.25,
     "rollout_lengths": "stratified",
     "action_repeat": None,
     "kl_bound": 1.0,
@@ -54,6 +55,7 @@ MODEL_BASED: dict[str, Any] = {
     "model_based.model_rollout_fraction": 0.5,
     "model_based.acceptance_rollouts": 50,
     "model_based.exploration_bonus": 0.1,
+    "model_based.improvement_steps": 20,
     "model_based.max_samples": 20_000,
 }
 SINGLE_STEP: dict[str, Any] = {
@@ -61,6 +63,8 @@ SINGLE_STEP: dict[str, Any] = {
     "model_based": None,
     "restart_probability": 0.02,
     "action_repeat": 1,
+    "initial_rollouts": 30,
+    "growth": 0.0,
     "window_steps": 0,
     "rollout_lengths": "independent",
     "eta_floor": 0.1,
@@ -99,6 +103,7 @@ def test_other_learners_have_these_defaults() -> None:
         "exploration.scale": 1.0,
         "initial_rollouts": 30,
         "rollouts_per_iteration": 10,
+        "growth": 0.0,
         "rollout_lengths": "independent",
     }
     assert flat(ValueIterationSettings()) == {**on_policy, "temperature": 1.0, "actions": 25}
@@ -319,6 +324,7 @@ OUT_OF_RANGE: dict[str, list[Any]] = {
     "window_steps": [value for value in NO_COUNTS if value is not None and value != 0],
     "initial_rollouts": NO_COUNTS,
     "rollouts_per_iteration": NO_COUNTS,
+    "growth": [-0.1, *NOT_FINITE, *NO_NUMBERS],
     "rollout_lengths": ["both", "", None, 1, ["stratified"]],
     "exploration.noise": ["brown", "", None, 1],
     "exploration.scale": [0.0, -1.0, *NOT_FINITE, *NO_NUMBERS],
@@ -340,6 +346,7 @@ OUT_OF_RANGE: dict[str, list[Any]] = {
     "model_based.model_rollout_fraction": [-0.1, 1.1, *NOT_FINITE, *NO_NUMBERS],
     "model_based.acceptance_rollouts": [-1, 1, 2.5, 4.0, "4", None, True],
     "model_based.exploration_bonus": [-0.1, *NOT_FINITE, *NO_NUMBERS],
+    "model_based.improvement_steps": [value for value in NO_COUNTS if value != 0],
     "model_based.max_samples": NO_COUNTS,
 }
 
@@ -366,6 +373,7 @@ TOO_FAR: dict[str, list[Any]] = {
     "window_steps": [10**15 + 1],
     "initial_rollouts": [100_001],
     "rollouts_per_iteration": [100_001],
+    "growth": [],
     "kl_bound": [],
     "ridge": [],
     "eta_floor": [],
@@ -379,6 +387,7 @@ TOO_FAR: dict[str, list[Any]] = {
     "model_based.proposal_std_scale": [1000.1, 1e300],
     "model_based.acceptance_rollouts": [100_001, 10**9],
     "model_based.exploration_bonus": [],
+    "model_based.improvement_steps": [100_001],
     "model_based.max_samples": [10_000_001],
 }
 """Besides whole numbers of 400 and of 5000 digits."""
@@ -443,6 +452,8 @@ AT_THE_EDGE: dict[str, list[Any]] = {
     "model_based.model_rollout_fraction": [0, 1.0],
     "model_based.acceptance_rollouts": [0, 2],
     "model_based.exploration_bonus": [0, 10.0],
+    "model_based.improvement_steps": [0, 1],
+    "growth": [0, 0.5],
 }
 
 

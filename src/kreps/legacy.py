@@ -102,13 +102,19 @@ ADDED_IN_0_1 = {
 """Settings that the first checkpoints of REPS lack, at the values that mean what these did."""
 
 
+NOT_IN_0_1 = {"window_steps": 0, "growth": 0.0, "action_repeat": 1}
+"""Settings that checkpoints of version 0.1 lack, at the values that mean what it did: its windows
+and batches count rollouts, and its actions are never held."""
+
+
 def checkpoint_settings(stored: Mapping[str, Any], method: str) -> dict[str, Any]:
     """All settings of a checkpoint of version 0.1, in the flat form."""
     if method != "reps":
         return present_settings(stored)
-    # windows of version 0.1 count rollouts only, and its actions are never held
-    now = present_settings({**ADDED_IN_0_1, **stored})
-    return {**now, "window_steps": 0, "action_repeat": 1}
+    settings = {**present_settings({**ADDED_IN_0_1, **stored}), **NOT_IN_0_1}
+    if settings.get("model_based", True) is not None:
+        settings["model_based.improvement_steps"] = 0
+    return settings
 
 
 # ---- progress.csv -----------------------------------------------------------------------------

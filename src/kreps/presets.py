@@ -27,6 +27,8 @@ from kreps.settings import (
 AnySettings = TypeVar("AnySettings", bound=LearnerSettings)
 
 SINGLE_STEP = Settings(
+    initial_rollouts=30,
+    growth=0.0,
     restart_probability=0.02,
     action_repeat=1,
     window_steps=0,

@@ -127,8 +127,13 @@ class ModelBased(Checked):
         acceptance_rollouts: model rollouts per policy in the acceptance test.  The previous policy
             is kept if the new return is lower by more than one standard error; 0 accepts all.
         exploration_bonus: of R-max: reward per step of an unexplored region, as a share of the
-            difference between the largest and the average reward, above the average.  It is
-            multiplied by 0.35 after each update; 0 switches it off.
+            difference between the largest and the average reward, above the average, once there
+            are the data of 30 mean rollouts.  It is multiplied by 0.35 with the data of each
+            further 10, and larger by the same rule before, up to 1.  While it is at least 0.005, a
+            policy that is optimised with it collects half of the rollouts; 0 switches it off.
+        improvement_steps: largest number of further steps in states that model rollouts of the
+            newest policy visit.  They end after three in a row without a gain in the model, and
+            the best policy is kept.  There are none without an acceptance test.
         max_samples: largest number of generated actions of an update.
     """
 
@@ -137,6 +142,7 @@ class ModelBased(Checked):
     model_rollout_fraction: float = 0.5
     acceptance_rollouts: int = 50
     exploration_bonus: float = 0.1
+    improvement_steps: int = 20
     max_samples: int = 20_000
 
     def __post_init__(self) -> None:
@@ -147,6 +153,8 @@ class ModelBased(Checked):
         self._check(
             "acceptance_rollouts", Integral, none_or_some, lambda v: v == 0 or 2 <= v <= MAX_COUNT
         )
+        steps = f"a whole number from 0 to {MAX_COUNT}"
+        self._check("improvement_steps", Integral, steps, lambda v: 0 <= v <= MAX_COUNT)
         self._check("exploration_bonus", Real, "finite and >= 0", lambda v: 0 <= v < inf)
 
 
@@ -202,6 +210,10 @@ class OnPolicySettings(LearnerSettings):
         rollouts_per_iteration: number of rollouts before each later update.  They are made with the
             current policy; or with bang-bang actions of red noise, if the reward of none of the
             newest rollouts depends on the state.
+        growth: if positive, batches are counted in environment steps and grow with the data: each
+            later update has new steps of this share of those seen so far, but at least as many as
+            two mean rollouts and at most as many as ``rollouts_per_iteration``.  More rollouts
+            are made where episodes end early, up to ten times as many.
         rollout_lengths: how the lengths are drawn, which are (1 - p) / p steps on average.
             ``"independent"``: each by itself, as printed.  ``"stratified"``: each from the same
             distribution, but one from each of R equally likely ranges for R rollouts, so that
@@ -211,6 +223,7 @@ class OnPolicySettings(LearnerSettings):
     exploration: Exploration = field(default_factory=Exploration)
     initial_rollouts: int = 30
     rollouts_per_iteration: int = 10
+    growth: float = 0.0
     rollout_lengths: RolloutLengths = "independent"
 
     def __post_init__(self) -> None:
@@ -218,6 +231,7 @@ class OnPolicySettings(LearnerSettings):
         self._section("exploration", Exploration)
         self._choose("rollout_lengths", RolloutLengths)
         self._whole("initial_rollouts", "rollouts_per_iteration", largest=MAX_COUNT)
+        self._check("growth", Real, "finite and >= 0", lambda v: 0 <= v < inf)
 
 
 @dataclass(frozen=True)
@@ -256,6 +270,8 @@ class Settings(OnPolicySettings):
     """
 
     restart_probability: float | None = None
+    initial_rollouts: int = 3
+    growth: float = 0.25
     window_steps: int = 1_000
     rollout_lengths: RolloutLengths = "stratified"
     action_repeat: int | None = None

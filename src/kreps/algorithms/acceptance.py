@@ -1,25 +1,28 @@
-"""The policy acceptance test: a new policy must not be worse than the previous one in the model.
+"""Comparison of policies by rollouts in the model, and the policy acceptance test.
 
 A one-step update can exploit errors of V and of the model together.  Long model rollouts do not
-use V, so the new and the previous policy are compared by them, with common random numbers.  The
-previous policy acts again where the new one is worse.
+use V, so policies are compared by them, with common random numbers.  Of the policies of an update
+the best one is kept; the previous policy acts again where it is better by more than one standard
+error.
 
 Far from the samples the model predicts an average reward, which late in learning is a good one.
-So rewards of states that are unlike any sample are shrunk towards the smallest one observed.  While
-there is an exploration bonus, these states get that bonus instead.  Rewards are not shrunk where
-episodes terminate: a policy that avoids the termination for longer visits new states, and would be
-rejected for it.
+So rewards of states that are unlike any sample are shrunk towards the smallest one observed.  The
+explorer, which is optimised with the exploration bonus, gets that bonus there instead.  Rewards are
+not shrunk where episodes terminate: a policy that avoids the termination for longer visits new
+states, and would be rejected for it.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from kreps.algorithms.dual import MIN_ETA
 from kreps.kernels.arrays import FloatArray
-from kreps.models.model_env import ModelRollouts, average_reward
+from kreps.models.model_env import average_reward
+from kreps.models.novelty import novelty_radius
 from kreps.models.world_model import WorldModel
 from kreps.policies.base import StochasticPolicy
 from kreps.settings import ModelBased, Settings
@@ -32,44 +35,65 @@ badly, about a hundredth of it per step, is not resolved at the higher floor.  W
 test the lower one lets the update exploit errors of the model."""
 
 
-def rejects(
-    new: StochasticPolicy,
-    previous: StochasticPolicy | None,
-    world: WorldModel,
-    rollouts: int,
-    rng: np.random.Generator,
-) -> bool | None:
-    """Whether the new policy earns less than the previous one by more than one standard error.
+@dataclass(frozen=True)
+class ModelComparison:
+    """Comparison of policies by rollouts in the model, with common random numbers.
 
-    The standard error is that of start states and noise; it does not contain errors of the model.
+    The standard error of a difference is that of start states and noise; it does not contain errors
+    of the model.
 
-    Args:
-        new, previous: both with their exploration noise; None before the first update.
+    Attributes:
         world: the learnt model.
-        rollouts: model rollouts per policy; 0 for no test.
-        rng: of the rollouts.
-
-    Returns:
-        None where there is no test.
+        rollouts: number of rollouts of each policy.
+        seed: of starts and noise, which are the same for all policies.
     """
-    if previous is None or world.model_env is None or not rollouts:
-        return None
-    model_env = replace(world.model_env, exploring_starts=0.0)
-    of_new, of_previous = model_env.evaluate((new, previous), world.reward_model, rollouts, rng)
-    can_terminate = model_env.dynamics.terminations is not None
-    typical = max(float(np.median(of_previous.similarity)), np.finfo(np.float64).tiny)
 
-    def returns(each: ModelRollouts) -> FloatArray:
-        if world.bonus is None and can_terminate:
-            rewards = each.rewards
-        elif world.bonus is None:
-            rewards = each.pessimistic_rewards(world.reward_model.smallest, typical)
-        else:
+    world: WorldModel
+    rollouts: int
+    seed: int
+
+    def returns(self, policy: StochasticPolicy) -> FloatArray:
+        """Average reward per step (rollouts,) from each start, standardised.
+
+        Args:
+            policy: with its exploration noise.
+        """
+        world = self.world
+        assert world.model_env is not None
+        model_env = replace(world.model_env, exploring_starts=0.0)
+        rng = np.random.default_rng(self.seed)
+        each = model_env.evaluate(policy, world.reward_model, self.rollouts, rng)
+        if world.bonus is not None:
             rewards = world.bonus.optimistic_rewards(each)
+        elif model_env.dynamics.terminations is not None:
+            rewards = each.rewards
+        else:
+            rewards = each.pessimistic_rewards(world.reward_model.smallest, self.typical)
         return average_reward(rewards, model_env.restart_probability)
 
-    gain = returns(of_new) - returns(of_previous)
-    return bool(gain.mean() < -gain.std(ddof=1) / np.sqrt(rollouts))
+    @cached_property
+    def typical(self) -> float:
+        """Similarity from which on a reward is used as predicted: at the median novelty radius."""
+        assert self.world.model_env is not None
+        radius = novelty_radius(self.world.model_env, share=0.5)
+        return 1.0 if radius is None else float(np.exp(-radius))
+
+
+def standard_error(gain: FloatArray) -> float:
+    """Of the mean of differences (n,)."""
+    return float(gain.std(ddof=1) / np.sqrt(len(gain)))
+
+
+def compare_in_model(world: WorldModel, rollouts: int, seed: int) -> ModelComparison | None:
+    """The comparison of an update; None where there is none.
+
+    Args:
+        world, seed: as of `ModelComparison`.
+        rollouts: per policy; 0 for no comparison.
+    """
+    if world.model_env is None or not rollouts:
+        return None
+    return ModelComparison(world, rollouts, seed)
 
 
 def temperature_floor(tested: bool, settings: Settings) -> float:

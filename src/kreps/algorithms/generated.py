@@ -24,6 +24,10 @@ from kreps.models.world_model import WorldModel
 from kreps.policies.base import StochasticPolicy
 from kreps.settings import ModelBased, Settings
 
+MAX_VISITED = 1_000
+"""Largest number of actions that are generated in model rollouts for one step: several such steps
+follow each other, and their cost is proportional to it."""
+
 
 class StateSource(Enum):
     """Which states actions are generated in."""
@@ -62,7 +66,7 @@ def split_budget(world: WorldModel, model_based: ModelBased) -> dict[StateSource
     budget = min(model_based.actions_per_state * len(world.states), model_based.max_samples)
     visited = 0
     if world.model_env is not None:
-        visited = round(model_based.model_rollout_fraction * budget)
+        visited = min(round(model_based.model_rollout_fraction * budget), MAX_VISITED)
     counts = {StateSource.REPLAY: budget - visited, StateSource.MODEL_ROLLOUT: visited}
     return {source: count for source, count in counts.items() if count}
 

@@ -1,9 +1,14 @@
 """The model-based step, which the paper has not: bounded steps on samples of the learnt model.
 
 This is the idea of Dyna (Sutton 1990).  In a first step states are resampled by the weights of
-Algorithm 1, in a second they are visited in model rollouts of the policy of the first.  In each
-state several actions are sampled around the policy's, and weighted by the same dual.  The new
-policy acts only if it passes an acceptance test against the previous one in the model.
+Algorithm 1, in the others they are visited in model rollouts of the policy of the step before.  In
+each state several actions are sampled around the policy's, and weighted by the same dual.  These
+steps go on while the model predicts a larger return, and the best policy is kept.  It acts only if
+it passes an acceptance test against the previous one.
+
+While there is an exploration bonus, an explorer is optimised with it in the same way.  It collects
+half of the next rollouts, and is neither tested nor reported: the acting policy is the best known,
+and a task that needs no exploration loses nothing but these rollouts.
 """
 
 from __future__ import annotations
@@ -13,7 +18,12 @@ from typing import Any
 
 import numpy as np
 
-from kreps.algorithms.acceptance import proposal_std_scale, rejects
+from kreps.algorithms.acceptance import (
+    ModelComparison,
+    compare_in_model,
+    proposal_std_scale,
+    standard_error,
+)
 from kreps.algorithms.dual import DualSolution
 from kreps.algorithms.ends import AbsorbingEnd, solve_with_end
 from kreps.algorithms.generated import GeneratedSamples, StateSource, generate, split_budget
@@ -24,6 +34,10 @@ from kreps.kernels.arrays import FloatArray
 from kreps.models.model_env import ModelEnv, supports_model_rollouts
 from kreps.models.novelty import novelty_bonus
 from kreps.models.world_model import WorldModel
+from kreps.policies.base import LearntPolicy
+
+PATIENCE = 3
+"""Steps in a row without a gain of one standard error in the model, after which there is none."""
 
 
 def generates_samples(batch: Batch[Any, Any]) -> bool:
@@ -67,7 +81,8 @@ class GeneratedStep:
         samples: generated actions, with the problem of their weights.
         dual: its solution.
         end: the state after a termination, with the average reward of the solution.
-        targets: weighted means of these actions, and of those of the step before if they are kept.
+        targets: weighted means of these actions, and of those in replayed states if they are kept.
+        replayed: weighted means of the actions of the first step, in replayed states.
         policy: fitted to the targets.
     """
 
@@ -75,42 +90,100 @@ class GeneratedStep:
     dual: DualSolution
     end: AbsorbingEnd | None
     targets: PolicyTargets
+    replayed: PolicyTargets
     policy: PolicyFit
+
+
+@dataclass(frozen=True)
+class ModelBasedResult:
+    """The results of the model-based step.
+
+    Attributes:
+        step: that of Algorithm 1, with the dual, the policy and the reward model of this one.
+        reward_start: log parameters of the reward model.
+        rejected: whether the acceptance test rejected the policy; None without a test.
+        explorer: policy with the exploration bonus; None where there is none.
+    """
+
+    step: Step
+    reward_start: FloatArray
+    rejected: bool | None
+    explorer: LearntPolicy | None
 
 
 def model_based_step(
     batch: Batch[Any, Any], step: Step, state: LearnerState, rng: np.random.Generator
-) -> tuple[Step, FloatArray, bool | None]:
-    """Bounded steps on generated samples, then the acceptance test.
+) -> ModelBasedResult:
+    """Bounded steps on generated samples, the acceptance test, and the explorer.
 
     Args:
         batch: the samples.
         step: of Algorithm 1 on them.
         state: the previous policy, and the start of the fit of the reward model.
         rng: of the generated samples, the fits and the test.
-
-    Returns:
-        The last step, the log parameters of the reward model, and whether the new policy is
-        rejected (None without a test).
     """
     model_based = batch.settings.model_based
     assert model_based is not None
-    world, reward_start = world_model(batch, step, state, rng)
-    sources = list(split_budget(world, model_based))
+    optimistic, reward_start = world_model(batch, step, state, rng)
+    world = replace(optimistic, bonus=None)
+    seed = int(rng.integers(2**63))  # all policies of an update have the same random numbers
+    comparison = compare_in_model(world, model_based.acceptance_rollouts, seed)
+    best = optimise(batch, world, step, comparison, rng)
+    rejected = None
+    if comparison is not None and state.policy is not None:
+        gain = comparison.returns(best.policy.policy) - comparison.returns(state.policy)
+        rejected = bool(gain.mean() < -standard_error(gain))
+        batch.clock.lap("acceptance test")
+    explorer = None
+    if optimistic.bonus is not None:
+        comparison = compare_in_model(optimistic, model_based.acceptance_rollouts, seed)
+        explorer = optimise(batch, optimistic, step, comparison, rng).policy.policy
+    step = replace(step, dual=best.dual, policy=best.policy, reward_model=world.reward_model)
+    return ModelBasedResult(step, reward_start, rejected, explorer)
+
+
+def optimise(
+    batch: Batch[Any, Any],
+    world: WorldModel,
+    step: Step,
+    comparison: ModelComparison | None,
+    rng: np.random.Generator,
+) -> GeneratedStep:
+    """Bounded steps on generated samples, while the model predicts a larger return.
+
+    Args:
+        batch: the samples from which the model was learnt.
+        world: the learnt model.
+        step: of Algorithm 1 on these samples.
+        comparison: of policies; None for one step per source of states.
+        rng: of the generated samples and the fits.
+
+    Returns:
+        The step whose policy has the largest return in the model; the last one without comparison.
+    """
+    model_based = batch.settings.model_based
+    assert model_based is not None
     latest: GeneratedStep | None = None
+    sources = list(split_budget(world, model_based))
     for source in sources:
-        # only the last policy acts, so only its standard deviation is deflated
-        last = source is sources[-1]
-        std_scale = proposal_std_scale(has_acceptance_test(batch), model_based) if last else 1.0
-        latest = generated_step(batch, world, step, latest, source, std_scale, rng)
+        # an intermediate policy does not act, so its standard deviation is not deflated
+        deflated = source is sources[-1]
+        latest = generated_step(batch, world, step, latest, source, deflated, rng)
     assert latest is not None
-    batch.clock.lap("generated samples")
-    rejected = rejects(
-        latest.policy.policy, state.policy, world, model_based.acceptance_rollouts, rng
-    )
-    batch.clock.lap("acceptance test")
-    step = replace(step, dual=latest.dual, policy=latest.policy, reward_model=world.reward_model)
-    return step, reward_start, rejected
+    if comparison is None or StateSource.MODEL_ROLLOUT not in sources:
+        return latest
+    best, returns, without_gain = latest, comparison.returns(latest.policy.policy), 0
+    for _ in range(model_based.improvement_steps):
+        latest = generated_step(batch, world, step, latest, sources[-1], True, rng)
+        new_returns = comparison.returns(latest.policy.policy)
+        batch.clock.lap("acceptance test")
+        gain = new_returns - returns
+        without_gain = 0 if gain.mean() > standard_error(gain) else without_gain + 1
+        if gain.mean() > 0.0:
+            best, returns = latest, new_returns
+        if without_gain == PATIENCE:
+            break
+    return best
 
 
 def generated_step(
@@ -119,7 +192,7 @@ def generated_step(
     step: Step,
     previous: GeneratedStep | None,
     source: StateSource,
-    std_scale: float,
+    deflated: bool,
     rng: np.random.Generator,
 ) -> GeneratedStep:
     """One bounded step on generated samples.
@@ -130,10 +203,12 @@ def generated_step(
         step: of Algorithm 1 on these samples.
         previous: the generated step before; None for the first, which follows ``step``.
         source: of the states.
-        std_scale: factor by which the standard deviation of the fitted policy is deflated.
+        deflated: whether the standard deviation of the fitted policy is divided by the factor of
+            the proposals.
         rng: of the generated samples and the fit.
     """
-    settings = batch.settings
+    settings, model_based = batch.settings, batch.settings.model_based
+    assert model_based is not None
     before = step if previous is None else previous
     ridge = stationarity_ridge(settings, step.model.errors)
     weights = batch.weights_in_memory(step.dual.weights)
@@ -155,13 +230,16 @@ def generated_step(
         samples.rewards,
         start=(1.0, before.dual.theta),
     )
+    batch.clock.lap("generated samples")
     targets = PolicyTargets.from_generated(samples, dual.weights, batch.task)
+    replayed = targets if previous is None else previous.replayed
     # Where not every rollout reached the goal, model rollouts may miss it too.  Then the targets
     # in replayed states are kept.
     if previous is not None and not batch.window.all_informative:
-        targets = targets.concat(previous.targets)
+        targets = targets.concat(replayed)
+    std_scale = proposal_std_scale(has_acceptance_test(batch), model_based) if deflated else 1.0
     policy = batch.fit_policy(targets, step.kernel, before.policy.x, rng, std_scale)
-    return GeneratedStep(samples, dual, end, targets, policy)
+    return GeneratedStep(samples, dual, end, targets, replayed, policy)
 
 
 def world_model(
@@ -169,6 +247,7 @@ def world_model(
 ) -> tuple[WorldModel, FloatArray]:
     """The learnt model as generated samples need it, and the log parameters of its reward model."""
     settings, features = batch.settings, step.features
+    decisions = state.steps / batch.task.action_repeat + batch.seen[1]
     model_env = None
     if has_model_rollouts(batch):
         assert step.model.dynamics is not None
@@ -201,7 +280,7 @@ def world_model(
             batch.rewards,
             weights,
             settings.model_based.exploration_bonus,
-            state.iteration,
+            decisions * settings.p,
         ),
     )
     return world, reward_start

@@ -27,6 +27,8 @@ class LearnerState:
         terminated: whether any of these rollouts ended by a termination.
         policy: the one that acts: that of the latest update, or the previous one if that was
             rejected; None before the first update.
+        explorer: policy that collects half of the next rollouts, as it was learnt with the
+            exploration bonus; None where there is none.
         value: V of the latest update, also if its policy was rejected; None for methods whose V is
             not linear in features.
         embedding_start, reward_start, policy_start: log hyper-parameters from which the next fits
@@ -39,6 +41,7 @@ class LearnerState:
     steps: int = 0
     terminated: bool = False
     policy: LearntPolicy | None = None
+    explorer: LearntPolicy | None = None
     value: LinearFunction | None = None
     embedding_start: FloatArray | None = None
     reward_start: FloatArray | None = None

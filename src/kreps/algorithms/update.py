@@ -42,13 +42,16 @@ def update(
     """
     batch = batch_of(state, samples, settings, rng, compute)
     step = reps_step(batch, state, temperature_floor(has_acceptance_test(batch), settings), rng)
-    reward_start, rejected = state.reward_start, None
+    reward_start, rejected, explorer = state.reward_start, None, None
     if generates_samples(batch):
-        step, reward_start, rejected = model_based_step(batch, step, state, rng)
+        found = model_based_step(batch, step, state, rng)
+        step, reward_start, rejected = found.step, found.reward_start, found.rejected
+        explorer = found.explorer
     new_state = state.after(
         *batch.seen,
         window=batch.window,
         policy=state.policy if rejected else step.policy.policy,
+        explorer=explorer,
         value=step.features.basis.function(batch.reward_unit * step.dual.theta),
         embedding_start=step.model.parameters,
         reward_start=reward_start,

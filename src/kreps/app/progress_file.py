@@ -7,8 +7,10 @@ range.  The quartiles are those of the new rollouts' mean rewards per step, each
 steps.  Steps and rewards per step are those of the environment; the restart probability is that at
 each decision, and ``action_repeat`` the steps for which one is held.  ``mean_return`` is the mean
 sum of the rewards of a new rollout, which a random restart may have cut, ``terminated`` the share
-of the new rollouts that ended by a termination.  The errors of dynamics, terminations and reward
-are those of `kreps.models.model_errors`.
+of the new rollouts that ended by a termination.  These
+numbers are of the acting policy's rollouts; ``explorer_share`` is the share of the steps that the
+explorer made.  The errors of dynamics, terminations and reward are those of
+`kreps.models.model_errors`.
 """
 
 from __future__ import annotations
@@ -69,6 +71,7 @@ ADDED_COLUMNS = (
     "time_limit",
     "restart_probability",
     "action_repeat",
+    "explorer_share",
 )
 """Columns that runs of earlier versions lack, in the order in which they were added.
 
@@ -125,7 +128,7 @@ RANGES = {
     **dict.fromkeys(("dynamics_error", "worst_dynamics_error"), NOT_NEGATIVE),
     **dict.fromkeys(("termination_error", "reward_error"), NOT_NEGATIVE),
     **dict.fromkeys(map(seconds_column, STAGES), NOT_NEGATIVE),
-    **dict.fromkeys(("clipped", "exploring", "rejected", "terminated"), SHARE),
+    **dict.fromkeys(("clipped", "exploring", "rejected", "terminated", "explorer_share"), SHARE),
     "restart_probability": SHARE,
 }
 """Smallest and largest value of columns whose numbers cannot be anything up to 1e100."""
@@ -241,6 +244,7 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "max_rank": max_rank(learner.settings),
         "ridge": info.ridge,
         "exploring": float(learner.exploring),
+        "explorer_share": report.explorer_share,
         "rejected": _or_nan(None if info.rejected is None else float(info.rejected)),
         "reward_lower_quartile": lower,
         "reward_upper_quartile": upper,

@@ -51,6 +51,7 @@ def collect(
     *,
     seed: int,
     iteration: int,
+    first: int = 0,
     restart_probability: float,
     stratified: bool = False,
     exponent: float = WHITE,
@@ -65,6 +66,7 @@ def collect(
         count: number of rollouts.
         seed: of the learner.
         iteration: number of updates so far; with the seed it addresses all random numbers.
+        first: number of the first of them in the iteration.
         restart_probability: p, which determines the distribution of lengths.
         stratified: whether lengths are stratified (`stratified_lengths`), so that each depends on
             ``count``.  If not, each is that of `RandomRestart` with the rollout's seed.
@@ -75,11 +77,12 @@ def collect(
         EnvironmentFailure: the environment raised an exception.
         DataError: it returned NaN, infinities or observations of another size.
     """
-    seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
-    rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in range(count)]
+    numbers = range(first, first + count)
+    seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in numbers]
+    rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in numbers]
     limit = -(-time_limit(env) // task.action_repeat)  # decisions
     if stratified:
-        rng = generator(seed, Purpose.RESTART, iteration)
+        rng = generator(seed, Purpose.RESTART, iteration, *([first] if first else ()))
         drawn = stratified_lengths(rng, restart_probability, count)
     else:
         drawn = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]

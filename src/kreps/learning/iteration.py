@@ -19,6 +19,8 @@ class IterationReport:
     Attributes:
         iteration: number of updates, this one included.
         rollouts, steps: number of rollouts and environment steps so far.
+        explorer_share: share of the new steps by the explorer.  The following numbers are of the
+            new rollouts of the acting policy alone.
         average_reward: mean reward per environment step of the new rollouts.
         mean_return: mean sum of the rewards of a new rollout, which a restart may have cut.
         terminated: share of the new rollouts that ended by a termination.
@@ -32,6 +34,7 @@ class IterationReport:
     iteration: int
     rollouts: int
     steps: int
+    explorer_share: float
     average_reward: float
     mean_return: float
     terminated: float

@@ -26,16 +26,14 @@ from kreps.errors import ConfigurationError, DataError, enough_memory, shown
 from kreps.kernels.arrays import default_errstate
 from kreps.kernels.threads import blas_threads
 from kreps.learning import storage, timescale
-from kreps.learning.collect import collect
+from kreps.learning.batches import Collected
 from kreps.learning.environment import Environment, environment_for, task_of
 from kreps.learning.iteration import Callback, IterationReport, callbacks_of, is_false
 from kreps.learning.policy import Policy
 from kreps.learning.wrappers import without_restarts
-from kreps.policies.base import StochasticPolicy
-from kreps.policies.exploration import PINK, RED, WHITE, BangBang, Gaussian
 from kreps.presets import changed, flat
 from kreps.seeding import Purpose, generator
-from kreps.settings import LearnerSettings, OnPolicySettings
+from kreps.settings import LearnerSettings
 
 
 def _whole_number(name: str, value: Any) -> int:
@@ -47,7 +45,6 @@ def _whole_number(name: str, value: Any) -> int:
 
 
 MethodSettings = TypeVar("MethodSettings", bound=LearnerSettings)
-OnPolicy = TypeVar("OnPolicy", bound=OnPolicySettings)
 
 
 class Learner(Generic[MethodSettings]):
@@ -216,20 +213,22 @@ class Learner(Generic[MethodSettings]):
         for _ in range(iterations):
             started, before = time.process_time(), self.state.steps
             with blas_threads(self.threads, exact=True), enough_memory("collecting rollouts"):
-                rollouts, taken = self._collected(self.env, on_rollout)
+                collected, taken = self._collected(self.env, on_rollout)
             seconds = time.process_time() - started
             probability, repeat = self.restart_probability, self.task.action_repeat
+            rollouts, explorer_share = collected.of_acting, collected.explorer_share
             lower, upper = rollouts.reward_quartiles()
-            info = self.update(rollouts)
+            info = self.update(collected.rollouts)
             self.state = replace(self.state, steps=before + taken)
             report = IterationReport(
                 iteration=self.state.iteration,
                 rollouts=self.state.rollouts,
                 steps=self.state.steps,
-                average_reward=float(rollouts.rewards.sum()) / taken,
+                average_reward=float(rollouts.rewards.sum()) / (taken * (1.0 - explorer_share)),
                 mean_return=float(rollouts.rewards.sum()) / len(rollouts),
                 terminated=float(rollouts.terminated.mean()),
                 reward_quartiles=(lower / repeat, upper / repeat),
+                explorer_share=explorer_share,
                 update=info,
                 rollout_seconds=seconds,
                 restart_probability=probability,
@@ -280,15 +279,15 @@ class Learner(Generic[MethodSettings]):
 
     def _collected(
         self, env: Environment, on_rollout: Callable[[int], None] | None
-    ) -> tuple[Rollouts, int]:
+    ) -> tuple[Collected, int]:
         """The rollouts of the next iteration, and the steps of the environment that they took."""
         if not isinstance(env, HeldActions):
-            rollouts = self._collect(env, on_rollout)
-            return rollouts, rollouts.steps
+            collected = self._collect(env, on_rollout)
+            return collected, collected.rollouts.steps
         before = env.steps_taken
         return self._collect(env, on_rollout), env.steps_taken - before
 
-    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
+    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Collected:
         """The rollouts of the next iteration.
 
         ``on_rollout`` is called with the number of rollouts that are complete.
@@ -331,47 +330,3 @@ class Learner(Generic[MethodSettings]):
             learner._act_in(env)
         learner.state = state
         return learner
-
-
-class OnPolicyLearner(Learner[OnPolicy]):
-    """A learner that collects rollouts by its own stochastic policy, from start states only.
-
-    These are the rollouts of Sec. 4.1.
-    """
-
-    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
-        policy, exponent = self._collecting_policy()
-        return collect(
-            env,
-            self.task,
-            policy,
-            self._rollout_count(),
-            seed=self.seed,
-            iteration=self.state.iteration,
-            restart_probability=self.restart_probability,
-            stratified=self.settings.rollout_lengths == "stratified",
-            exponent=exponent,
-            on_rollout=on_rollout,
-        )
-
-    def _rollout_count(self) -> int:
-        """Number of rollouts in the next iteration."""
-        first = self.state.iteration == 0
-        return self.settings.initial_rollouts if first else self.settings.rollouts_per_iteration
-
-    @property
-    @default_errstate()
-    def exploring(self) -> bool:
-        window = self.state.window
-        return len(window.rollouts) > 0 and not window.newest_depend_on_state
-
-    def _collecting_policy(self) -> tuple[StochasticPolicy, float]:
-        """The policy of the next rollouts, and the exponent of its noise's spectrum."""
-        if self.exploring:
-            return BangBang(self.task), RED
-        if self.state.policy is not None:
-            return self.state.policy, WHITE
-        if self.settings.exploration.noise == "bang-bang":
-            return BangBang(self.task), WHITE
-        gaussian = Gaussian(self.task, self.settings.exploration.scale)
-        return gaussian, PINK if self.settings.exploration.noise == "pink" else WHITE

@@ -12,14 +12,16 @@ from kreps.algorithms.state import LearnerState, UpdateReport
 from kreps.algorithms.update import update as reps_update
 from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
-from kreps.data.rollouts import Rollout, Rollouts
+from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError
 from kreps.kernels.basis import LinearFunction
 from kreps.learning import timescale
+from kreps.learning.batches import Collected
 from kreps.learning.collect import collect_grid
 from kreps.learning.environment import Environment
-from kreps.learning.learner import Learner, OnPolicyLearner
+from kreps.learning.learner import Learner
+from kreps.learning.on_policy import OnPolicyLearner
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
 from kreps.presets import settings_of
 from kreps.settings import (
@@ -140,7 +142,7 @@ class GridValueIteration(Learner[GridValueIterationSettings]):
     settings_type = GridValueIterationSettings
     algorithm = staticmethod(value_iteration.update)
 
-    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Rollouts:
+    def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Collected:
         settings = self.settings
         rollouts = collect_grid(
             env,
@@ -154,7 +156,7 @@ class GridValueIteration(Learner[GridValueIterationSettings]):
         )
         if on_rollout is not None:
             on_rollout(len(rollouts))
-        return rollouts
+        return Collected(rollouts, len(rollouts))
 
 
 class NPALP(OnPolicyLearner[NPALPSettings]):

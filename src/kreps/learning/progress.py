@@ -121,6 +121,8 @@ class ProgressTable:
             self._stages[name] = self._stages.get(name, 0.0) + seconds
         shown = report.update.shown()
         note = shown.pop("note", "")
+        if report.explorer_share > 0.0:
+            note = f"{note}  {report.explorer_share:.0%} of the steps by the explorer".strip()
         if learner.exploring:
             note = f"{note}  no state-dependent reward: exploring".strip()
         row = {

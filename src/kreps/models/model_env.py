@@ -7,7 +7,7 @@ states that the new policy visits, and they predict its return before it acts (s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil
@@ -25,6 +25,10 @@ from kreps.policies.base import StochasticPolicy
 EVALUATION_LENGTHS = 2.0
 """Steps over which a policy is evaluated, in mean lengths of a rollout: by then a share of
 exp(-2) of the rollouts would not have been restarted."""
+
+
+MAX_EVALUATION_STEPS = 200
+"""Largest number of steps of a rollout in which a policy is evaluated."""
 
 
 def supports_model_rollouts(data: Transitions, task: TaskSpec) -> bool:
@@ -77,7 +81,7 @@ def average_reward(rewards: FloatArray, restart_probability: float) -> FloatArra
 
 @dataclass(frozen=True)
 class RolloutNoise:
-    """The random numbers of one step of m rollouts, common to all policies compared.
+    """The random numbers of one step of m rollouts.
 
     Attributes:
         action_noise: (m, da) standard normal.
@@ -94,14 +98,6 @@ class RolloutNoise:
         action_noise = rng.standard_normal((count, action_size))
         residual_signs = np.where(rng.integers(2, size=(count, 1)) == 0, 1.0, -1.0)
         return cls(action_noise, residual_signs, rng.uniform(size=count))
-
-    def repeated(self, times: int) -> RolloutNoise:
-        """The same numbers for each of so many policies."""
-        return RolloutNoise(
-            np.tile(self.action_noise, (times, 1)),
-            np.tile(self.residual_signs, (times, 1)),
-            np.tile(self.end_uniforms, times),
-        )
 
 
 @dataclass(frozen=True)
@@ -176,33 +172,28 @@ class ModelEnv:
 
     def evaluate(
         self,
-        policies: Sequence[StochasticPolicy],
+        policy: StochasticPolicy,
         reward: Callable[[FloatArray, FloatArray], FloatArray],
         count: int,
         rng: np.random.Generator,
-    ) -> list[ModelRollouts]:
-        """Rollouts of each policy, without random restarts, with common random numbers.
+    ) -> ModelRollouts:
+        """Rollouts of a policy without random restarts.
 
         Args:
-            policies: with their exploration noise.
+            policy: with its exploration noise.
             reward: expected reward (m,) of states and scaled, applied actions (m, ds + da), and of
                 probabilities of a termination (m,).
-            count: rollouts per policy.
+            count: number of rollouts.
             rng: of starts and noise.
         """
-        many = len(policies)
         steps = min(ceil(EVALUATION_LENGTHS / self.restart_probability), self.max_steps)
-
-        def act(states: FloatArray, noise: FloatArray) -> FloatArray:
-            parts = zip(policies, np.split(states, many), np.split(noise, many), strict=True)
-            return np.concatenate([policy.act(*part) for policy, *part in parts])
-
+        steps = min(steps, MAX_EVALUATION_STEPS)
         inputs, similarity, terminations, ended = [], [], [], []
-        over = np.zeros(many * count, dtype=bool)
-        states = np.tile(self._starts(count, rng), (many, 1))
+        over = np.zeros(count, dtype=bool)
+        states = self._starts(count, rng)
         for _ in range(steps):
-            noise = RolloutNoise.sample(count, self.task.action_size, rng).repeated(many)
-            step = self._step(act, states, noise)
+            noise = RolloutNoise.sample(count, self.task.action_size, rng)
+            step = self._step(policy.act, states, noise)
             inputs.append(step.inputs)
             similarity.append(step.similarity)
             terminations.append(step.terminations)
@@ -211,11 +202,8 @@ class ModelEnv:
             states = step.successors
         rewards = reward(np.concatenate(inputs), np.concatenate(terminations))
         rewards = np.where(np.concatenate(ended), self.end_reward, rewards)
-        each = (
-            np.split(np.reshape(values, (steps, many * count)), many, axis=1)
-            for values in (rewards, similarity, ended)
-        )
-        return [ModelRollouts(*parts) for parts in zip(*each, strict=True)]
+        shape = steps, count
+        return ModelRollouts(rewards.reshape(shape), np.stack(similarity), np.stack(ended))
 
     def trajectories(
         self, policy: StochasticPolicy, starts: FloatArray, steps: int, rng: np.random.Generator

@@ -18,9 +18,11 @@ import numpy as np
 from kreps.kernels.arrays import FloatArray
 from kreps.models.model_env import ModelEnv, ModelRollouts
 
-DECAY = 0.35
-"""Factor of the bonus after each update: a region that is still unexplored after some updates has
-not been visited despite its bonus."""
+DECAY, DECAY_ROLLOUTS, FULL_ROLLOUTS = 0.35, 10.0, 30.0
+"""The bonus is as set after data of `FULL_ROLLOUTS` mean rollouts, and falls to `DECAY` of itself
+with the data of each further `DECAY_ROLLOUTS`: a region that is still unexplored then has not been
+visited despite its bonus.  With fewer data it is larger by the same rule, up to all of the way to
+the optimistic reward (R-max)."""
 
 MIN_STRENGTH = 0.005
 """A smaller bonus is left out."""
@@ -29,8 +31,13 @@ MAX_REWARD_SD = 2.0
 """Largest optimistic reward, in standard deviations above the mean reward: where the best reward is
 a goal that is seldom reached, an unexplored region need not hold another one."""
 
-KNOWN_QUANTILE = 0.9
+KNOWN_SHARE = 0.9
 """Share of the samples that lie within the novelty radius of a sample of another rollout."""
+
+MAX_RADIUS = 0.06
+"""Largest novelty radius per factor of the kernel.  Two random samples are about half a unit per
+factor apart.  With few rollouts, one that went far is alone in its region, and without this limit
+would make every state count as explored."""
 
 MIN_RADIUS = 1e-12
 """Smallest novelty radius: states that are equal up to rounding are explored."""
@@ -93,7 +100,7 @@ def novelty_bonus(
     rewards: FloatArray,
     weights: FloatArray,
     initial: float,
-    updates: int,
+    rollouts: float,
 ) -> NoveltyBonus | None:
     """The exploration bonus of one update; None where there is none.
 
@@ -101,11 +108,12 @@ def novelty_bonus(
         model_env: of the samples; None if the model cannot be rolled out.
         rewards: (n,) of the samples, standardised.
         weights: (n,) of the first step, which sum to one.
-        initial: bonus of the first update, as a share of the way from the average reward to the
-            best one.
-        updates: made before.
+        initial: bonus after `FULL_ROLLOUTS` rollouts, as a share of the way from the average reward
+            to the best one.
+        rollouts: samples seen so far, in mean lengths of a rollout.
     """
-    strength = initial * DECAY**updates
+    decayed = DECAY ** ((rollouts - FULL_ROLLOUTS) / DECAY_ROLLOUTS)
+    strength = min(initial * decayed, max(1.0, initial))
     if model_env is None or strength < MIN_STRENGTH:
         return None
     radius = novelty_radius(model_env)
@@ -116,13 +124,17 @@ def novelty_bonus(
     return NoveltyBonus(average + strength * max(best - average, 0.0), average, radius)
 
 
-def novelty_radius(model_env: ModelEnv, block_size: int = BLOCK_SIZE) -> float | None:
+def novelty_radius(
+    model_env: ModelEnv, share: float = KNOWN_SHARE, block_size: int = BLOCK_SIZE
+) -> float | None:
     """Half the squared distance, in lengthscales, within which most samples have another rollout's.
 
     Samples of the same rollout do not count, as they are near in any case.
 
     Args:
         model_env: of the samples.
+        share: of the samples that have a sample of another rollout within the radius, unless it
+            is limited by `MAX_RADIUS`.
         block_size: samples compared with all others at once.
 
     Returns:
@@ -136,5 +148,6 @@ def novelty_radius(model_env: ModelEnv, block_size: int = BLOCK_SIZE) -> float |
         similarity = model_env.kernel.gram(states[i : i + block_size], states)
         similarity[rollout[i : i + block_size, None] == rollout] = 0.0
         nearest.append(similarity.max(axis=1))
-    at_radius = np.quantile(np.concatenate(nearest), 1.0 - KNOWN_QUANTILE)
-    return max(-float(np.log(max(at_radius, _TINY))), MIN_RADIUS)
+    at_radius = np.quantile(np.concatenate(nearest), 1.0 - share)
+    largest = MAX_RADIUS * len(model_env.kernel.lengthscales)
+    return min(max(-float(np.log(max(at_radius, _TINY))), MIN_RADIUS), largest)

@@ -18,6 +18,7 @@ from kreps.kernels.threads import blas_threads
 from kreps.learning.storage.codec import (
     Array,
     Converted,
+    OneOf,
     Optional,
     Record,
     StoredArrays,
@@ -29,6 +30,7 @@ from kreps.learning.storage.policies import (
     POLICY,
     TASK,
     decode_task,
+    gaussian_processes,
     kernel_schema,
     task_sizes,
 )
@@ -67,15 +69,16 @@ STATE = Record(
         "terminated": Converted(Whole(bits=1), int, lambda stored, given: bool(stored)),
         "window": Converted(Optional(ROLLOUTS), _stored_window, _window),
         "policy": Optional(POLICY),
+        "explorer": Optional(OneOf(gaussian_processes("e"))),
         "value": Optional(VALUE),
         "embedding_start": Optional(Array(("g+da+1",))),
         "reward_start": Optional(Array(("g+w+da+1",))),
         "policy_start": Optional(Array(("g+2",))),
     },
-    absent={"terminated": 0},
+    absent={"terminated": 0, "explorer": None},
 )
 """Sizes beside those of policies: w angles that wrap in V and in the reward model (0 without V),
-r centres of V, n steps and R rollouts of the window."""
+e support points of the explorer, r centres of V, n steps and R rollouts of the window."""
 
 
 def _encoded(state: LearnerState, task: TaskSpec) -> tuple[Any, Tensors]:

@@ -109,54 +109,61 @@ def kernel_schema(wraps: str | int) -> Converted:
     )
 
 
-SUPPORT = {"m": (1, MAX_SUPPORT)}
-KERNEL_AND_STATES: dict[str, Node] = {
-    "kernel": kernel_schema(wraps=0),
-    "states": Array(("m", "ds")),
-}
+SUPPORT = (1, MAX_SUPPORT)
+
+
+def _kernel_and_states(m: str) -> dict[str, Node]:
+    return {"kernel": kernel_schema(wraps=0), "states": Array((m, "ds"))}
+
+
+def gaussian_processes(m: str) -> dict[str, Record]:
+    """Gaussian-process policies of m support points, by kind; m is the letter of their number."""
+    cost_sensitive = Record(
+        CostSensitiveGP,
+        {
+            **_kernel_and_states(m),
+            "targets": Array((m, "da")),
+            "weights": Array((m,), POSITIVE),
+            "signal": Number(POSITIVE),
+            "noise": Number(POSITIVE),
+        },
+        given=("task",),
+        ranges={m: SUPPORT},
+    )
+    sparse = Record(
+        SparseGP,
+        {
+            **_kernel_and_states(m),
+            "mean_weights": Array((m, "da")),
+            "explained": Array((m, m)),
+            "signal": Number(POSITIVE),
+            "noise": Number(POSITIVE),
+        },
+        given=("task",),
+        ranges={m: SUPPORT},
+    )
+    return {"cost-sensitive-gp": cost_sensitive, "sparse-gp": sparse}
+
 
 POLICY = OneOf(
     {
-        "cost-sensitive-gp": Record(
-            CostSensitiveGP,
-            {
-                **KERNEL_AND_STATES,
-                "targets": Array(("m", "da")),
-                "weights": Array(("m",), POSITIVE),
-                "signal": Number(POSITIVE),
-                "noise": Number(POSITIVE),
-            },
-            given=("task",),
-            ranges=SUPPORT,
-        ),
-        "sparse-gp": Record(
-            SparseGP,
-            {
-                **KERNEL_AND_STATES,
-                "mean_weights": Array(("m", "da")),
-                "explained": Array(("m", "m")),
-                "signal": Number(POSITIVE),
-                "noise": Number(POSITIVE),
-            },
-            given=("task",),
-            ranges=SUPPORT,
-        ),
+        **gaussian_processes("m"),
         "softmax": Record(
             SoftmaxPolicy,
             {
-                **KERNEL_AND_STATES,
+                **_kernel_and_states("m"),
                 "table": Array(("m", "k")),
                 "candidates": Array(("k", "da")),
                 "offset": Number(),
                 "temperature": Number(TEMPERATURE),
             },
             given=("task",),
-            ranges={**SUPPORT, "k": (1, MAX_SUPPORT)},
+            ranges={"m": SUPPORT, "k": (1, MAX_SUPPORT)},
         ),
         "lipschitz": Record(
             LipschitzPolicy,
             {
-                **KERNEL_AND_STATES,
+                **_kernel_and_states("m"),
                 "actions": Array(("m", "da")),
                 "bounds": Array(("m",)),
                 "slope": Number(NOT_NEGATIVE),
@@ -164,7 +171,7 @@ POLICY = OneOf(
                 "noise_scale": Number(NOT_NEGATIVE),
             },
             given=("task",),
-            ranges=SUPPORT,
+            ranges={"m": SUPPORT},
         ),
     }
 )
