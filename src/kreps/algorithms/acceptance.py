@@ -21,7 +21,7 @@ import numpy as np
 
 from kreps.algorithms.dual import MIN_ETA
 from kreps.kernels.arrays import FloatArray
-from kreps.models.model_env import average_reward
+from kreps.models.model_env import ModelEnv, average_reward
 from kreps.models.novelty import novelty_radius
 from kreps.models.world_model import WorldModel
 from kreps.policies.base import StochasticPolicy
@@ -58,9 +58,7 @@ class ModelComparison:
         Args:
             policy: with its exploration noise.
         """
-        world = self.world
-        assert world.model_env is not None
-        model_env = replace(world.model_env, exploring_starts=0.0)
+        world, model_env = self.world, self._from_starts
         rng = np.random.default_rng(self.seed)
         each = model_env.evaluate(policy, world.reward_model, self.rollouts, rng)
         if world.bonus is not None:
@@ -70,6 +68,12 @@ class ModelComparison:
         else:
             rewards = each.pessimistic_rewards(world.reward_model.smallest, self.typical)
         return average_reward(rewards, model_env.restart_probability)
+
+    @cached_property
+    def _from_starts(self) -> ModelEnv:
+        """The model whose rollouts all begin in start states, with what it computes only once."""
+        assert self.world.model_env is not None
+        return replace(self.world.model_env, exploring_starts=0.0)
 
     @cached_property
     def typical(self) -> float:

@@ -128,16 +128,16 @@ def model_based_step(
     world = replace(optimistic, bonus=None)
     seed = int(rng.integers(2**63))  # all policies of an update have the same random numbers
     comparison = compare_in_model(world, model_based.acceptance_rollouts, seed)
-    best = optimise(batch, world, step, comparison, rng)
+    best, returns = optimise(batch, world, step, comparison, rng)
     rejected = None
-    if comparison is not None and state.policy is not None:
-        gain = comparison.returns(best.policy.policy) - comparison.returns(state.policy)
+    if comparison is not None and returns is not None and state.policy is not None:
+        gain = returns - comparison.returns(state.policy)
         rejected = bool(gain.mean() < -standard_error(gain))
         batch.clock.lap("acceptance test")
     explorer = None
     if optimistic.bonus is not None:
         comparison = compare_in_model(optimistic, model_based.acceptance_rollouts, seed)
-        explorer = optimise(batch, optimistic, step, comparison, rng).policy.policy
+        explorer = optimise(batch, optimistic, step, comparison, rng)[0].policy.policy
     step = replace(step, dual=best.dual, policy=best.policy, reward_model=world.reward_model)
     return ModelBasedResult(step, reward_start, rejected, explorer)
 
@@ -148,7 +148,7 @@ def optimise(
     step: Step,
     comparison: ModelComparison | None,
     rng: np.random.Generator,
-) -> GeneratedStep:
+) -> tuple[GeneratedStep, FloatArray | None]:
     """Bounded steps on generated samples, while the model predicts a larger return.
 
     Args:
@@ -159,7 +159,8 @@ def optimise(
         rng: of the generated samples and the fits.
 
     Returns:
-        The step whose policy has the largest return in the model; the last one without comparison.
+        The step whose policy has the largest return in the model, and its returns (rollouts,);
+        the last step without a comparison.
     """
     model_based = batch.settings.model_based
     assert model_based is not None
@@ -170,9 +171,11 @@ def optimise(
         deflated = source is sources[-1]
         latest = generated_step(batch, world, step, latest, source, deflated, rng)
     assert latest is not None
-    if comparison is None or StateSource.MODEL_ROLLOUT not in sources:
-        return latest
+    if comparison is None:
+        return latest, None
     best, returns, without_gain = latest, comparison.returns(latest.policy.policy), 0
+    if StateSource.MODEL_ROLLOUT not in sources:
+        return best, returns
     for _ in range(model_based.improvement_steps):
         latest = generated_step(batch, world, step, latest, sources[-1], True, rng)
         new_returns = comparison.returns(latest.policy.policy)
@@ -183,7 +186,7 @@ def optimise(
             best, returns = latest, new_returns
         if without_gain == PATIENCE:
             break
-    return best
+    return best, returns
 
 
 def generated_step(

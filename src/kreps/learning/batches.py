@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import ceil, floor
+from math import ceil
+
+import numpy as np
 
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
@@ -15,7 +17,6 @@ from kreps.settings import OnPolicySettings
 
 MIN_ROLLOUTS = 2
 """Smallest size of a growing batch, in mean rollouts: one of the policy and one of the explorer."""
-
 
 MAX_SHORT_ROLLOUTS = 10
 """Largest number of rollouts per mean rollout of a growing batch, however early episodes end."""
@@ -90,10 +91,7 @@ def collect_batch(
         if on_rollout is not None:
             on_rollout(before + count)
 
-    for number, policy in enumerate(policies):
-        missing = size / len(policies)
-        if not settings.growth:  # whole rollouts, one more for the acting policy if they are odd
-            missing = floor(missing) if number else size - floor(missing) * (len(policies) - 1)
+    for policy, missing in zip(policies, _parts(size, len(policies), settings), strict=True):
         most = len(collected) + ceil(MAX_SHORT_ROLLOUTS * missing)
         while len(collected) < most:
             before = len(collected)
@@ -116,3 +114,10 @@ def collect_batch(
                 break
         acting = acting or len(collected)
     return Collected(Rollouts.from_list(collected), acting)
+
+
+def _parts(size: float, count: int, settings: OnPolicySettings) -> list[float]:
+    """Equal parts of a batch; in whole rollouts, the larger part first, if batches do not grow."""
+    if settings.growth:
+        return [size / count] * count
+    return [len(part) for part in np.array_split(np.arange(round(size)), count)]
