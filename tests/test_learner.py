@@ -43,6 +43,12 @@ def swing_up(seed: int = 0, **settings: Any) -> kreps.KREPS:
 @pytest.fixture(scope="module")
 def learnt() -> kreps.KREPS:
     """After two iterations.  Tests must not change it."""
+    return swing_up().learn(2, progress=False)
+
+
+@pytest.fixture(scope="module")
+def without_explorer() -> kreps.KREPS:
+    """The same, of which every rollout is the acting policy's."""
     return swing_up(**NO_EXPLORER).learn(2, progress=False)
 
 
@@ -74,11 +80,11 @@ def collected(learner: kreps.KREPS, policy: StochasticPolicy, iteration: int) ->
     )
 
 
-def test_counts_include_forgotten_rollouts(learnt: kreps.KREPS) -> None:
-    state = learnt.state
+def test_counts_include_forgotten_rollouts(without_explorer: kreps.KREPS) -> None:
+    state = without_explorer.state
     assert (state.iteration, state.rollouts) == (2, 9)
     assert len(state.window.rollouts) == 6
-    first = collected(learnt, BangBang(learnt.task), 0)
+    first = collected(without_explorer, BangBang(without_explorer.task), 0)
     assert state.steps == first.steps + state.window.rollouts[3:].steps
     for mine, theirs in zip(state.window.rollouts[:3], first[3:], strict=True):
         np.testing.assert_array_equal(mine.actions, theirs.actions)
@@ -108,7 +114,7 @@ def test_updates_from_given_rollouts_need_no_environment(learnt: kreps.KREPS) ->
     assert learner.state.rollouts == 8
 
 
-def test_learn_is_collect_and_update(learnt: kreps.KREPS) -> None:
+def test_learn_is_collect_and_update(without_explorer: kreps.KREPS) -> None:
     by_hand = swing_up(**NO_EXPLORER)
     policy: StochasticPolicy = BangBang(by_hand.task)
     for iteration in (0, 1):
@@ -117,7 +123,7 @@ def test_learn_is_collect_and_update(learnt: kreps.KREPS) -> None:
         policy = by_hand.state.policy
     np.testing.assert_allclose(
         by_hand.policy.predict(STATES, deterministic=True)[0],
-        learnt.policy.predict(STATES, deterministic=True)[0],
+        without_explorer.policy.predict(STATES, deterministic=True)[0],
         rtol=0,
         atol=1e-6,
     )
