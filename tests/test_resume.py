@@ -19,12 +19,13 @@ import kreps
 from kreps.app.run_folder import RunConfig, RunFolder
 from kreps.learning.iteration import IterationReport
 
-TINY: dict[str, Any] = {
+BATCHES: dict[str, Any] = {
     "initial_rollouts": 6,
     "rollouts_per_iteration": 3,
     "growth": 0.0,
     "window": 6,
 }
+TINY = BATCHES | {"model_based.improvement_steps": 2}
 NAME = "kreps/SwingUp-v0"
 COMMAND = [sys.executable, "-m", "kreps"]
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
@@ -97,7 +98,8 @@ def ten_in_one_go(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_two_and_two_iterations_are_four(settings: dict[str, Any], tmp_path: Path) -> None:
     def learner() -> kreps.KREPS:
-        return kreps.KREPS(gym.make(NAME), seed=5, **TINY, **settings)
+        tiny = BATCHES if "preset" in settings else TINY
+        return kreps.KREPS(gym.make(NAME), seed=5, **tiny, **settings)
 
     learner().learn(2, progress=False).save(tmp_path / "half")
     resumed = kreps.KREPS.resume(tmp_path / "half", gym.make(NAME)).learn(2, progress=False)
