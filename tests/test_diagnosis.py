@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -826,8 +827,11 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
     assert (row["mean_return"], row["terminated"]) == (-20.0, 0.1)
     assert row["explorer_share"] == 0.4
     assert row["time_limit"] == 80 and row["restart_probability"] == 0.02
+    assert row["robot_seconds"] == 50.0  # 1000 steps at 20 Hz
     learner.env = gym.make("kreps/SwingUp-v0")
     assert np.isnan(progress_row(learner, iteration)["time_limit"])
+    learner.task = replace(task, dt=None)
+    assert np.isnan(progress_row(learner, iteration)["robot_seconds"])
 
 
 def test_a_goal_that_was_not_reached_is_the_limit() -> None:

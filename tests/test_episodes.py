@@ -155,6 +155,7 @@ def curve(length: float, **limit: str) -> Any:
             "mean_return": str(10.0 * i),
             "terminated": "0.0",
             "time_limit": "nan",
+            "robot_seconds": "nan",
             "kl": "0.5",
             "kl_bound": "1.0",
             "effective_samples": "20",

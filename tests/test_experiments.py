@@ -23,6 +23,7 @@ from kreps.experiments.figures import (
     markdown_table,
     named_rows,
     rows_of,
+    steps_table,
     summarise,
     write_figure,
     write_results,
@@ -462,6 +463,23 @@ def test_a_figure_is_written_as_csv_json_markdown_and_png(tmp_path: Path) -> Non
     assert all(path.stat().st_size > 0 for path in paths)
     assert commits_of(results) == "abc"
     assert len(rows_of(results)) == 6  # the grid needs one iteration only
+
+
+def test_the_table_by_steps_has_the_robot_time_of_each_task_and_no_empty_column() -> None:
+    rows = [
+        {"task": task, "method": f"m, {task}", "seed": seed, "steps": steps}
+        | {"stochastic": -30.0 - seed, "greedy": -20.0 - seed}
+        for task in ("swing-up", "mountain-car")
+        for seed in (0, 1)
+        for steps in (400, 960)
+    ]
+    *heading, time, stochastic, greedy, other, _, _ = steps_table(rows).splitlines()
+    assert heading[0] == "| mean (worst seed) | 500 steps | 750 steps | 1000 steps |"
+    assert time == "| robot time, swing-up | 25 s | 37.5 s | 50 s |"  # at 20 Hz
+    assert stochastic.startswith("| m, swing-up, stochastic | -30.5 (-31.0) | -30.5")
+    assert greedy.startswith("| m, swing-up, greedy | -20.5 (-21.0)")
+    assert other == "| robot time, mountain-car | 16.67 s | 25 s | 33.33 s |"  # at 30 Hz
+    assert "| robot time | 25 s" in steps_table(rows[:4])
 
 
 def test_the_picture_of_the_image_features_is_written(tmp_path: Path) -> None:

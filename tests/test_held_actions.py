@@ -252,6 +252,7 @@ def test_progress_has_the_repeat() -> None:
     learner.learn(1, callback=lambda *given: rows.append(progress_row(*given)), progress=False)
     assert (rows[0]["action_repeat"], rows[0]["restart_probability"]) == (4, 1 / 75)
     assert rows[0]["time_limit"] == 300
+    assert rows[0]["robot_seconds"] == pytest.approx(0.01 * learner.env.unwrapped.steps)
 
 
 # ---- predicting -------------------------------------------------------------------------------

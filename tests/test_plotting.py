@@ -53,6 +53,7 @@ def rows(count: int) -> list[dict[str, str]]:
             "mean_return": str(25 * (-90.0 + 10 * i)),
             "terminated": "0.0",
             "time_limit": "nan",
+            "robot_seconds": "nan",
         }
         for i in range(count)
     ]
@@ -116,6 +117,21 @@ def test_the_curve_names_every_reference_value_and_the_evaluation() -> None:
     assert at_the_end == {-30.0, -25.0}
     labels = [t.get_text() for t in top.get_legend().get_texts()]
     assert any("-25" in label and "greedy" in label for label in labels)
+
+
+def test_the_curve_has_the_robot_time_below_the_steps_where_it_is_recorded() -> None:
+    unknown = learning_curve(rows(3), {}, None, "title")
+    assert [axes.child_axes for axes in unknown.axes] == [[], [], []]
+    known = [row | {"robot_seconds": str(0.05 * int(row["steps"]))} for row in rows(3)]
+    figure = learning_curve(known, {}, None, "title")
+    (below,) = figure.axes[-1].child_axes
+    assert below.get_xlabel() == "robot time [s]"
+    FigureCanvasAgg(figure).draw()
+    steps, seconds = figure.axes[-1].get_xlim(), below.get_xlim()
+    np.testing.assert_allclose(seconds, 0.05 * np.asarray(steps))
+    assert figure.bbox.y0 < below.xaxis.label.get_window_extent().y0
+    first = figure.axes[-1].xaxis.label.get_window_extent()
+    assert below.xaxis.get_tightbbox().y1 < first.y0  # type: ignore[union-attr]
 
 
 def drawn(figure: Figure, artist: Any) -> Any:
@@ -472,4 +488,7 @@ def test_learning_curves_show_means_and_level_lines(tmp_path: Path) -> None:
     level = np.asarray(in_training["once, one iteration"].get_ydata(), dtype=float)
     np.testing.assert_allclose(level, -39.0)  # evaluated: nothing was trained on
     assert greedy.get_xlabel() == "environment steps"
+    assert [axes.child_axes for axes in figure.axes] == [[], [], []]
+    timed = experiment_plots.learning_curves(data, REFERENCES, "", "", period=0.05)
+    assert [len(axes.child_axes) for axes in timed.axes] == [0, 1, 1]  # the first is by iteration
     plotting.save(figure, tmp_path / "curves.png")

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from kreps.data.task import TaskSpec
 from kreps.learning import progress
 from kreps.learning.progress import ProgressTable
 from kreps.terminal import Output
@@ -37,12 +38,12 @@ class Update:
         }
 
 
-def report(iteration: int) -> Any:
+def report(iteration: int, reward: float = -1.234e-6) -> Any:
     return SimpleNamespace(
         iteration=iteration,
         steps=500 * iteration,
-        average_reward=-1.234e-6,
-        mean_return=-6.17e-5,
+        average_reward=reward,
+        mean_return=50 * reward,
         update=Update(),
         rollout_seconds=0.1,
         explorer_share=0.0,
@@ -50,12 +51,16 @@ def report(iteration: int) -> Any:
 
 
 def learner(
-    exploring: bool = False, terminated: bool = False, env: gym.Env[Any, Any] | None = None
+    exploring: bool = False,
+    terminated: bool = False,
+    env: gym.Env[Any, Any] | None = None,
+    dt: float | None = None,
 ) -> Any:
     """What the table reads of a learner."""
     rollouts = SimpleNamespace(terminated=np.array([False, terminated]))
     state = SimpleNamespace(window=SimpleNamespace(rollouts=rollouts))
-    return SimpleNamespace(exploring=exploring, env=env, state=state)
+    task = TaskSpec(1, np.array([-1.0]), np.array([1.0]), dt=dt)
+    return SimpleNamespace(exploring=exploring, env=env, state=state, task=task)
 
 
 class Screen:
@@ -183,3 +188,24 @@ def test_all_columns_fit_in_eighty_letters_with_a_return(monkeypatch: pytest.Mon
     with ProgressTable(1) as table:
         table(learner(terminated=True), report(1))
     assert re.search(r"iter +steps +reward +return +KL / bound.* CPU s", out.getvalue())
+
+
+def test_the_robot_time_is_shown_where_the_control_period_is_known(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for dt, shown in ((0.05, "steps 1500  robot s 75.0  reward"), (None, "steps 1500  reward")):
+        with ProgressTable(3) as table:
+            table(learner(dt=dt), report(3))
+        assert shown in capsys.readouterr().out
+
+
+def test_all_columns_fit_in_eighty_letters_with_a_robot_time(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    out = io.StringIO()
+    console = Console(file=out, force_terminal=True, width=80, height=24)
+    monkeypatch.setattr(progress, "Console", lambda: console)
+    with ProgressTable(30) as table:
+        table(learner(terminated=True, dt=0.05), report(30, reward=-22.13))
+    assert re.search(r"iter +steps +robot s +reward +return.* CPU s", out.getvalue())
+    assert re.search(r"30 +15000 +750\.0 +-22\.13", out.getvalue())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,11 @@ COLOURS = ("#20639b", "#d1603d", "#c29b19", "#8e5ea2", "#5b6068", "#3caea3")
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1)), (0, (7, 2)))
 """Likewise the line styles, which distinguish the curves without their colours."""
 
+SECOND_AXIS = 32.0
+"""Distance of a second x-axis from the first one, in points: below its numbers and its label."""
+SECOND_AXIS_HEIGHT = 0.5
+"""Of a second x-axis with its numbers and its label, in inches."""
+
 OFF_SCALE = 5.0
 """Few values are left out of an axis if it is shorter by more than this factor without them."""
 
@@ -77,6 +83,21 @@ def draw_references(axes: Axes, references: Mapping[str, float], *, named: bool 
             fontsize=7.5,
         )
         above = value
+
+
+def add_robot_time(axes: Axes, period: float | None) -> None:
+    """A second axis below that of the environment steps, in seconds of robot time.
+
+    Args:
+        axes: with environment steps on their x-axis.
+        period: seconds per step; None adds no axis.
+    """
+    if period is None:
+        return
+    seconds, steps = partial(np.multiply, period), partial(np.multiply, 1.0 / period)
+    below = axes.secondary_xaxis("bottom", functions=(seconds, steps))
+    below.spines["bottom"].set_position(("outward", SECOND_AXIS))
+    below.set_xlabel("robot time [s]")
 
 
 def limits_of_most(

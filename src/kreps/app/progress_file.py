@@ -5,7 +5,8 @@ number of samples with a weight in the last step of an update, generated ones in
 ``policy_noise`` is the policy's standard deviation near its data, in units of half the action
 range.  The quartiles are those of the new rollouts' mean rewards per step, each counted by its
 steps.  Steps and rewards per step are those of the environment; the restart probability is that at
-each decision, and ``action_repeat`` the steps for which one is held.  ``mean_return`` is the mean
+each decision, and ``action_repeat`` the steps for which one is held.  ``robot_seconds`` are the
+steps so far times the control period, without resets.  ``mean_return`` is the mean
 sum of the rewards of a new rollout, which a random restart may have cut, ``terminated`` the share
 of the new rollouts that ended by a termination.  These
 numbers are of the acting policy's rollouts; ``explorer_share`` is the share of the steps that the
@@ -72,12 +73,13 @@ ADDED_COLUMNS = (
     "restart_probability",
     "action_repeat",
     "explorer_share",
+    "robot_seconds",
 )
 """Columns that runs of earlier versions lack, in the order in which they were added.
 
 A missing one is read as NaN.  Present ones may be NaN: the errors without such a model,
 ``max_rank`` with a fixed number of features of V, ``rejected`` without an acceptance test,
-``time_limit`` of an environment that has none.
+``time_limit`` of an environment that has none, ``robot_seconds`` without a known control period.
 """
 
 
@@ -126,7 +128,7 @@ RANGES = {
     **dict.fromkeys(("kl_bound", "eta", "effective_samples", "ridge"), POSITIVE),
     **dict.fromkeys(("jitter", "eta_floor", "policy_noise", "model_error"), NOT_NEGATIVE),
     **dict.fromkeys(("dynamics_error", "worst_dynamics_error"), NOT_NEGATIVE),
-    **dict.fromkeys(("termination_error", "reward_error"), NOT_NEGATIVE),
+    **dict.fromkeys(("termination_error", "reward_error", "robot_seconds"), NOT_NEGATIVE),
     **dict.fromkeys(map(seconds_column, STAGES), NOT_NEGATIVE),
     **dict.fromkeys(("clipped", "exploring", "rejected", "terminated", "explorer_share"), SHARE),
     "restart_probability": SHARE,
@@ -258,5 +260,6 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "time_limit": episode_limit(learner),
         "restart_probability": report.restart_probability,
         "action_repeat": learner.task.action_repeat,
+        "robot_seconds": round(_or_nan(learner.task.robot_seconds(report.steps)), 6),
         **{seconds_column(stage): round(seconds.get(stage, 0.0), 5) for stage in STAGES},
     }

@@ -92,9 +92,11 @@ def _say_pictures(paths: Iterable[Path]) -> None:
 
 def _say_summary(folder: RunFolder, learner: KREPS, evaluation: Mapping[str, Evaluation]) -> None:
     state, rows = learner.state, folder.rows()
+    seconds = learner.task.robot_seconds(state.steps)
+    robot_time = "" if seconds is None else f", {seconds:.1f} s of robot time"
     text = (
         f"\n{state.iteration} updates from {state.rollouts} rollouts "
-        f"({state.steps} environment steps)."
+        f"({state.steps} environment steps{robot_time})."
     )
     if evaluation:
         greedy, stochastic = evaluation["greedy"], evaluation["stochastic"]

@@ -217,6 +217,14 @@ class TaskSpec:
         """Largest number of decisions in an episode; None without a known time limit."""
         return None if self.time_limit is None else ceil(self.time_limit / self.action_repeat)
 
+    def robot_seconds(self, steps: int) -> float | None:
+        """Seconds that so many steps of the environment take, without the time of resets.
+
+        The steps are single ones, as they are reported, however long an action is held.  None if
+        ``dt`` is not known.
+        """
+        return None if self.dt is None else steps * self.dt
+
     @property
     def action_centre(self) -> FloatArray:
         """Middle of the range (da,)."""

@@ -6,6 +6,7 @@ import csv
 import io
 import json
 from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from kreps.experiments.specs import METHODS, TASKS
 from kreps.experiments.tables import markdown
 from kreps.experiments.trials import commits_of
 from kreps.learning.collect import simulate
+from kreps.learning.control_period import control_period
 from kreps.learning.environment import opened, task_of
 from kreps.learning.storage import write_atomically
 from kreps.policies.exploration import BangBang
@@ -133,8 +135,23 @@ def markdown_table(summary: Mapping[str, Mapping[str, Any]]) -> str:
     return markdown([*TABLE_HEADINGS, "iterations", "CPU s / update"], rows)
 
 
-MARKS = (3000, 5000, 6000, 8000, 20_000)
+@cache
+def period_of(task: str) -> float | None:
+    """Control period of a key of `TASKS`, in s; None if its environment does not tell it."""
+    with opened(TASKS[task].environment) as env:
+        return control_period(env)
+
+
+def robot_time(steps: int, period: float) -> str:
+    """The seconds that steps of a control period take, as text."""
+    return f"{steps * period:.4g} s"
+
+
+MARKS = (300, 500, 750, 1000, 3000, 5000, 6000, 8000, 20_000)
 """Numbers of environment steps at which the tables give the reward."""
+
+UNKNOWN = "–"
+"""Cell of a table without a value."""
 
 
 def at_most(curve: Sequence[Mapping[str, Any]], steps: float) -> Mapping[str, Any]:
@@ -158,23 +175,40 @@ def value_at(curves: Sequence[Sequence[Mapping[str, Any]]], name: str, mark: flo
     """
     steps = [[float(row["steps"]) for row in curve] for curve in curves]
     if max(map(min, steps)) > mark or np.mean([max(s) for s in steps]) < 0.95 * mark:
-        return "–"
+        return UNKNOWN
     values = [float(at_most(curve, mark)[name]) for curve in curves]
     places = 1 if min(values) < -10.0 else 2 if min(values) < -1.0 else 3
     return f"{np.mean(values):.{places}f} ({min(values):.{places}f})"
 
 
 def steps_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """The documentation's table of reward by environment steps: mean and worst seed at `MARKS`."""
-    lines = []
-    for method in dict.fromkeys(row["method"] for row in rows):
-        mine = [row for row in rows if row["method"] == method]
-        seeds = sorted({int(row["seed"]) for row in mine})
-        curves = [[row for row in mine if int(row["seed"]) == seed] for seed in seeds]
-        for name in ("stochastic", "greedy"):
-            values = (value_at(curves, name, mark) for mark in MARKS)
-            lines.append([f"{method}, {name}", *values])
-    return markdown(["mean (worst seed)", *(f"{mark} steps" for mark in MARKS)], lines)
+    """The documentation's table of reward by environment steps: mean and worst seed at `MARKS`.
+
+    Marks without any value are left out.  The first row of each task has the robot time of the
+    steps, where its control period is known.
+    """
+    grouped: dict[tuple[str, str], dict[int, list[Mapping[str, Any]]]] = {}
+    for row in rows:
+        of_seed = grouped.setdefault((row["task"], row["method"]), {})
+        of_seed.setdefault(int(row["seed"]), []).append(row)
+    curves = {
+        names: [of_seed[seed] for seed in sorted(of_seed)] for names, of_seed in grouped.items()
+    }
+    marks = [
+        mark
+        for mark in MARKS
+        if any(value_at(each, "greedy", mark) != UNKNOWN for each in curves.values())
+    ]
+    lines, tasks = [], list(dict.fromkeys(task for task, _ in curves))
+    for task in tasks:
+        period, suffix = period_of(task), "" if len(tasks) == 1 else f", {task}"
+        if period is not None:
+            lines.append([f"robot time{suffix}", *(robot_time(mark, period) for mark in marks)])
+        for (of_task, method), each in curves.items():
+            for name in ("stochastic", "greedy") if of_task == task else ():
+                values = (value_at(each, name, mark) for mark in marks)
+                lines.append([f"{method}, {name}", *values])
+    return markdown(["mean (worst seed)", *(f"{mark} steps" for mark in marks)], lines)
 
 
 TITLES = {
@@ -220,13 +254,15 @@ def write_figure(
     references = {
         row["method"]: REFERENCE_REWARDS.get(TASKS[row["task"]].environment, {}) for row in rows
     }
+    periods = {period_of(row["task"]) for row in rows}
+    period = periods.pop() if len(periods) == 1 else None
     source = f"{command}   (commit {commits_of(results)})"
     if name in SEED_BY_SEED:
-        figure = plots.comparison(rows, references, TITLES[name], source)
+        figure = plots.comparison(rows, references, TITLES[name], source, period)
     else:
         of_first = next(iter(references.values()))
         known = list(METHODS) if rows[0]["method"] in METHODS else []
-        figure = plots.learning_curves(rows, of_first, TITLES[name], source, known)
+        figure = plots.learning_curves(rows, of_first, TITLES[name], source, known, period)
     picture = plotting.save(figure, folder / f"{name}.png")
     return [folder / f"{name}.{ending}" for ending in ("csv", "json", "md")] + [picture]
 

@@ -12,7 +12,16 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from kreps.kernels.arrays import FloatArray
-from kreps.plotting import BLUE, COLOURS, GREY, LINES, ORANGE, STYLE, draw_references
+from kreps.plotting import (
+    BLUE,
+    COLOURS,
+    GREY,
+    LINES,
+    ORANGE,
+    STYLE,
+    add_robot_time,
+    draw_references,
+)
 
 
 def comparison(
@@ -20,6 +29,7 @@ def comparison(
     references: Mapping[str, Mapping[str, float]],
     title: str,
     source: str,
+    period: float | None = None,
 ) -> Figure:
     """A curve per seed against environment steps, and their mean, in two panels per method.
 
@@ -31,6 +41,7 @@ def comparison(
             methods, the methods are on different tasks and their panels have different scales.
         title: of the figure.
         source: command and commit, printed below.
+        period: seconds per environment step, if all methods have the same.
     """
     methods = list(dict.fromkeys(row["method"] for row in rows))
     across = min(len(methods), 4)
@@ -56,6 +67,7 @@ def comparison(
             axes.set_ylabel("average reward per step")
         for axes in plots[-1]:
             axes.set_xlabel("environment steps")
+            add_robot_time(axes, period if axes.axison else None)
         figure.suptitle(title, fontweight="bold")
         figure.supxlabel(source, fontsize=6.5, color=GREY)
     return figure
@@ -94,6 +106,7 @@ def learning_curves(
     title: str,
     source: str,
     known: Sequence[str] = (),
+    period: float | None = None,
 ) -> Figure:
     """Mean and twice the standard error of each method, by iteration and by environment steps.
 
@@ -106,6 +119,7 @@ def learning_curves(
         title: of the figure.
         source: command and commit, printed below.
         known: methods with the same colour in all figures.
+        period: seconds per environment step, if all methods have the same.
     """
     methods = list(dict.fromkeys(row["method"] for row in rows))
     index = {name: i for i, name in enumerate(dict.fromkeys([*known, *methods]))}
@@ -123,6 +137,7 @@ def learning_curves(
         for axes, (_, by, heading) in zip(plots, PANELS, strict=True):
             axes.set_title(heading)
             axes.set_xlabel("iteration" if by == "iteration" else "environment steps")
+            add_robot_time(axes, None if by == "iteration" else period)
             axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
             axes.set_ylim(low - 0.06 * (high - low), high + 0.10 * (high - low))
             draw_references(axes, references, named=axes is plots[-1])

@@ -58,8 +58,9 @@ class ProgressTable:
     In a terminal a row stays where it was printed, above a bar at the bottom, so that the newest
     row and the bar are visible in a window of any height.  The headings are repeated before they
     leave the window.  Columns that do not fit in its width are left out; all numbers are in the
-    reports.  "reward" is per step; "return", where the task ends episodes, is the mean sum of the
-    rewards of the new rollouts, which random restarts may have cut.
+    reports.  "robot s" is the robot time of all steps so far, without resets, where the control
+    period is known.  "reward" is per step; "return", where the task ends episodes, is the mean sum
+    of the rewards of the new rollouts, which random restarts may have cut.
 
     Args:
         target: number of updates after which learning ends.
@@ -125,9 +126,11 @@ class ProgressTable:
             note = f"{note}  {report.explorer_share:.0%} of the steps by the explorer".strip()
         if learner.exploring:
             note = f"{note}  no state-dependent reward: exploring".strip()
+        robot = learner.task.robot_seconds(report.steps)
         row = {
             "iter": f"{report.iteration}",
             "steps": f"{report.steps}",
+            **({} if robot is None else {"robot s": f"{robot:.1f}"}),
             "reward": f"{report.average_reward:.4g}",
             **({"return": f"{report.mean_return:.4g}"} if ends_episodes(learner) else {}),
             **shown,

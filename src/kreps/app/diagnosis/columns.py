@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from kreps.app.diagnosis.thresholds import RECENT
+from kreps.data.task import is_period
 from kreps.kernels.arrays import FloatArray
 
 Row = Mapping[str, Any]
@@ -78,6 +79,12 @@ def action_repeats(rows: Sequence[Row]) -> FloatArray:
     """Steps for which an action was held, 1 in runs of versions that could not hold it: (m,)."""
     found = column(rows, "action_repeat")
     return np.where(np.isfinite(found), found, 1.0)
+
+
+def control_period(rows: Sequence[Row]) -> float | None:
+    """Seconds of robot time per step of the environment; None if they are not recorded."""
+    period = latest(rows, "robot_seconds") / latest(rows, "steps")
+    return period if is_period(period) else None
 
 
 def ends_episodes(rows: Sequence[Row]) -> bool:

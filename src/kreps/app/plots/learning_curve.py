@@ -14,6 +14,7 @@ from matplotlib.transforms import ScaledTranslation
 from kreps.app.diagnosis.columns import (
     Row,
     column,
+    control_period,
     effective_share,
     ends_episodes,
     rollout_lengths,
@@ -23,7 +24,9 @@ from kreps.plotting import (
     GREY,
     ORANGE,
     PURPLE,
+    SECOND_AXIS_HEIGHT,
     STYLE,
+    add_robot_time,
     draw_references,
     limits_of_most,
     mark_beyond,
@@ -46,6 +49,7 @@ def learning_curve(
 ) -> Figure:
     """Average reward against environment steps, above KL divergence and effective sample size.
 
+    A second axis has the robot time of the steps, where the control period is known.
     Where the task ends episodes, the return is between them.
 
     Args:
@@ -54,15 +58,16 @@ def learning_curve(
         evaluation: of ``evaluation.json``, drawn at the last step.
         title: of the figure.
     """
-    steps = column(rows, "steps")
+    steps, period = column(rows, "steps"), control_period(rows)
+    below = 0.0 if period is None else SECOND_AXIS_HEIGHT
     with rc_context(STYLE):
         if ends_episodes(rows):
-            figure = Figure(figsize=(7.0, 8.5))
+            figure = Figure(figsize=(7.0, 8.5 + below))
             plots = figure.subplots(4, 1, sharex=True, height_ratios=(4, 2, 1, 1))
             top, returns, middle, bottom = plots
             draw_returns(returns, rows, evaluation)
         else:
-            figure = Figure(figsize=(7.0, 6.0))
+            figure = Figure(figsize=(7.0, 6.0 + below))
             top, middle, bottom = figure.subplots(3, 1, sharex=True, height_ratios=(4, 1, 1))
         draw_rewards(top, rows, references, evaluation)
         figure.suptitle(title, x=0.02, ha="left", fontsize=10, fontweight="bold")
@@ -74,6 +79,7 @@ def learning_curve(
         bottom.set_ylabel("effective\nsample share")
         bottom.set_ylim(0.0, 1.05)
         bottom.set_xlabel("environment steps")
+        add_robot_time(bottom, period)
     return figure
 
 
