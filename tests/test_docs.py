@@ -19,6 +19,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "benchmarks")]
 import peers_seconds  # noqa: E402
 import peers_table  # noqa: E402
+import robot_time  # noqa: E402
 from fill_tables import filled  # noqa: E402
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -80,8 +81,8 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
             with open(ROOT / "results" / f"{name.removesuffix('-steps')}.csv", newline="") as file:
                 assert table == steps_table(named_rows(list(csv.DictReader(file))))
             continue
-        if name == "peers":
-            assert table == peers_table.table()
+        if name in ("peers", "robot-time"):
+            assert table == {"peers": peers_table, "robot-time": robot_time}[name].table()
             continue
         folder = ROOT / ("src/kreps/experiments" if name == "search" else "results")
         content = json.loads((folder / f"{name}.json").read_text())
