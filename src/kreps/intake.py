@@ -165,3 +165,18 @@ def ended_by(terminated: Any, steps: int) -> bool:
             "where the task ended"
         )
     return bool(each[-1])
+
+
+def as_times(times: Any, steps: int) -> NDArray[np.float64]:
+    """A copy of the time stamps in s of the observations of a rollout of so many steps.
+
+    Raises:
+        DataError: as `as_numbers`, another number of them, or times that do not increase.
+    """
+    stamps = as_numbers("times", times, "leave the times out")
+    if stamps.shape != (steps + 1,) or not (np.diff(stamps) > 0.0).all():
+        raise DataError(
+            f"times of shape {stamps.shape}, but {steps + 1} increasing numbers are needed, one "
+            "for each observation; leave the times out if they are not known"
+        )
+    return stamps

@@ -1,4 +1,4 @@
-"""One rollout as users build it, many rollouts in flat arrays, and their transitions."""
+"""Many rollouts in flat arrays, and their transitions."""
 
 from __future__ import annotations
 
@@ -10,80 +10,18 @@ from typing import Any, overload
 
 import numpy as np
 
+from kreps.data.rollout import DROP, read_only
+from kreps.data.rollout import Rollout as Rollout
 from kreps.data.task import TaskSpec
 from kreps.errors import DataError
 from kreps.intake import (
     as_array,
     as_flags,
-    as_numbers,
     as_rows,
-    ended_by,
     first_invalid_row,
     invalid,
 )
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
-
-
-@dataclass(frozen=True, eq=False)
-class Rollout:
-    """One rollout of ``T >= 1`` steps.
-
-    Arrays are checked and copied when it is made, so that a reused buffer cannot change it.
-
-    Attributes:
-        observations: (T + 1, ds); row t + 1 is the successor of row t.  The last row is the
-            successor of the last step, observed before any restart.  Observations of more axes are
-            flattened.
-        actions: (T, da) as the policy commanded them, before clipping.  Those of more axes are
-            flattened, and those of one coordinate may be given as (T,).
-        rewards: (T,).
-        terminated: whether the task ended with the last step.  False if the rollout was only cut
-            off, by a restart or a time limit.  It may be given as a flag for each step, (T,).
-
-    Raises:
-        DataError: wrong shapes, no step at all, NaN or infinities, masked values, numbers or flags
-            that are none.
-    """
-
-    observations: FloatArray
-    actions: FloatArray
-    rewards: FloatArray
-    terminated: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("observations", "actions", "rewards"):
-            values = as_rows(name, as_numbers(name, getattr(self, name), _DROP))
-            object.__setattr__(self, name, _read_only(values))
-        steps = len(self.rewards)
-        if steps == 0:
-            raise DataError("the rollout has no step; leave empty rollouts out")
-        if len(self.actions) != steps or len(self.observations) != steps + 1:
-            raise DataError(
-                f"{len(self.observations)} observations, {len(self.actions)} actions and {steps} "
-                "rewards do not fit together: T rewards need T actions and T + 1 observations "
-                "(the last one is the successor of the last step)"
-            )
-        object.__setattr__(self, "terminated", ended_by(self.terminated, steps))
-
-    @classmethod
-    def _view(
-        cls, observations: FloatArray, actions: FloatArray, rewards: FloatArray, terminated: bool
-    ) -> Rollout:
-        """A rollout whose arrays are neither copied nor checked again."""
-        made = object.__new__(cls)
-        values = (observations, actions, rewards, terminated)
-        for field, value in zip(fields(cls), values, strict=True):
-            object.__setattr__(made, field.name, value)
-        return made
-
-    def __len__(self) -> int:
-        """Number of steps T."""
-        return len(self.rewards)
-
-    @property
-    def widths(self) -> tuple[int, int]:
-        """``(ds, da)``."""
-        return self.observations.shape[1], self.actions.shape[1]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -99,6 +37,8 @@ class Rollouts(Sequence[Rollout]):
         rewards: (n,).
         offsets: (R + 1,) number of steps before each rollout, and n.
         terminated: (R,) whether the task ended with the last step of each rollout.
+        times: (n + R,) time stamp of each row of ``points`` in s; None unless every rollout has
+            time stamps.
     """
 
     points: FloatArray
@@ -106,6 +46,7 @@ class Rollouts(Sequence[Rollout]):
     rewards: FloatArray
     offsets: IntArray
     terminated: BoolArray
+    times: FloatArray | None = None
 
     @classmethod
     def from_list(cls, rollouts: Iterable[Rollout]) -> Rollouts:
@@ -132,12 +73,14 @@ class Rollouts(Sequence[Rollout]):
                 )
         if not items:
             return NO_ROLLOUTS
+        times = [r.times for r in items if r.times is not None]
         return cls(
-            _read_only(np.concatenate([r.observations for r in items])),
-            _read_only(np.concatenate([r.actions for r in items])),
-            _read_only(np.concatenate([r.rewards for r in items])),
+            read_only(np.concatenate([r.observations for r in items])),
+            read_only(np.concatenate([r.actions for r in items])),
+            read_only(np.concatenate([r.rewards for r in items])),
             np.cumsum([0, *(len(r) for r in items)]),
             np.array([r.terminated for r in items]),
+            read_only(np.concatenate(times)) if len(times) == len(items) else None,
         )
 
     @classmethod
@@ -207,10 +150,10 @@ class Rollouts(Sequence[Rollout]):
             if (row := first_invalid_row(values)) is not None:
                 rollout, t = self.place(row, of_points=name == "observations")
                 where = f"row {t} of rollout {rollout}"
-                raise DataError(f"{invalid(name)}, first in {where}; {_DROP}")
-            arrays.append(_read_only(values))
+                raise DataError(f"{invalid(name)}, first in {where}; {DROP}")
+            arrays.append(read_only(values))
         points, actions, rewards = arrays
-        return Rollouts(points, actions, rewards, self.offsets, self.terminated)
+        return Rollouts(points, actions, rewards, self.offsets, self.terminated, self.times)
 
     def place(self, row: int, *, of_points: bool = False) -> tuple[int, int]:
         """The rollout of a step, or of a row of ``points``, and the row's number in it."""
@@ -248,11 +191,12 @@ class Rollouts(Sequence[Rollout]):
             return self._slice(index)
         i = range(len(self))[operator.index(index)]
         low, high = self.offsets[i], self.offsets[i + 1]
-        return Rollout._view(
+        return Rollout.view(
             self.points[low + i : high + i + 1],
             self.actions[low:high],
             self.rewards[low:high],
             bool(self.terminated[i]),
+            None if self.times is None else self.times[low + i : high + i + 1],
         )
 
     def _slice(self, index: slice) -> Rollouts:
@@ -267,6 +211,7 @@ class Rollouts(Sequence[Rollout]):
             self.rewards[low:high],
             self.offsets[first : last + 1] - low,
             self.terminated[first:last],
+            None if self.times is None else self.times[low + first : high + last],
         )
 
     def __repr__(self) -> str:
@@ -382,14 +327,6 @@ class Transitions:
             rewards=self.rewards[chosen],
             terminated=self.terminated[chosen],
         )
-
-
-_DROP = "drop the rollout, or cut it before that step"
-
-
-def _read_only(values: FloatArray) -> FloatArray:
-    values.flags.writeable = False
-    return values
 
 
 NO_ROLLOUTS = Rollouts(

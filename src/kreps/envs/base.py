@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from kreps.envs.batch import BatchModel
+from kreps.envs.batch import BatchModel, time_stamps_of
 from kreps.errors import DataError
 from kreps.intake import as_numbers
 from kreps.kernels.arrays import FloatArray
@@ -17,10 +17,11 @@ from kreps.kernels.arrays import FloatArray
 class BatchEnvironment(gym.Env[FloatArray, FloatArray]):
     """An environment whose dynamics are those of its ``batch_model``.
 
-    A subclass sets ``batch_model``, the spaces and `picture`.
+    A subclass sets ``batch_model``, the spaces and `picture`.  Where control periods vary, ``info``
+    has the time since the start in s, under ``"time"``.
     """
 
-    batch_model: ClassVar[BatchModel]
+    batch_model: BatchModel
 
     def __init__(
         self,
@@ -38,7 +39,7 @@ class BatchEnvironment(gym.Env[FloatArray, FloatArray]):
     ) -> tuple[FloatArray, dict[str, Any]]:
         super().reset(seed=seed)
         self._states = self.batch_model.initial([self.np_random])
-        return self._observe(), {}
+        return self._observe(), self._info()
 
     def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
         """One control period.
@@ -54,7 +55,7 @@ class BatchEnvironment(gym.Env[FloatArray, FloatArray]):
         self._states, rewards, ends = self.batch_model.step(
             self._states, values.reshape(1, -1), [self.np_random]
         )
-        return self._observe(), float(rewards[0]), bool(ends[0]), False, {}
+        return self._observe(), float(rewards[0]), bool(ends[0]), False, self._info()
 
     def render(self) -> Any:
         return self.picture(self._states[0]) if self.render_mode == "rgb_array" else None
@@ -65,3 +66,7 @@ class BatchEnvironment(gym.Env[FloatArray, FloatArray]):
 
     def _observe(self) -> FloatArray:
         return self.batch_model.observe(self._states)[0].copy()
+
+    def _info(self) -> dict[str, Any]:
+        times = time_stamps_of(self.batch_model, self._states)
+        return {} if times is None else {"time": float(times[0])}

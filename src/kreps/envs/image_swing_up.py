@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -30,26 +31,34 @@ def image(theta: FloatArray) -> FloatArray:
     return np.exp(-0.5 * squares / BLUR**2)
 
 
+@dataclass(frozen=True)
 class ImageSwingUpBatch:
     """The swing-up for m rollouts at once, observed as images.
 
-    States (m, 3) are angle, velocity, and the angle one step earlier for the difference image.
+    States (m, 3) are those of the swing-up, with jitter one more, and the angle one step earlier
+    for the difference image.
+
+    Attributes:
+        dynamics: of the swing-up.
     """
 
-    _dynamics = SwingUpBatch()
+    dynamics: SwingUpBatch = SwingUpBatch()  # noqa: RUF009 (it is immutable)
 
     def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
-        states = self._dynamics.initial(rngs)
+        states = self.dynamics.initial(rngs)
         return np.column_stack([states, states[:, 0]])
 
     def observe(self, states: FloatArray) -> FloatArray:
         now = image(states[:, 0])
-        return np.concatenate([now, now - image(states[:, 2])], axis=1)
+        return np.concatenate([now, now - image(states[:, -1])], axis=1)
+
+    def time_stamps(self, states: FloatArray) -> FloatArray | None:
+        return self.dynamics.time_stamps(states)
 
     def step(
         self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        successors, rewards, done = self._dynamics.step(states[:, :2], actions, rngs)
+        successors, rewards, done = self.dynamics.step(states[:, :-1], actions, rngs)
         return np.column_stack([successors, states[:, 0]]), rewards, done
 
 
@@ -98,7 +107,7 @@ class ImageSwingUp(BatchEnvironment):
 
     ## Arguments
 
-    `render_mode`: `None` or `"rgb_array"`.
+    `render_mode`, `dry_friction` and `jitter` as in `kreps/SwingUp-v0`.
 
     ```python
     >>> import gymnasium as gym
@@ -122,7 +131,11 @@ class ImageSwingUp(BatchEnvironment):
     }
     batch_model = ImageSwingUpBatch()
 
-    def __init__(self, render_mode: str | None = None) -> None:
+    def __init__(
+        self, render_mode: str | None = None, dry_friction: float = 0.0, jitter: float = 0.0
+    ) -> None:
+        if dry_friction or jitter:
+            self.batch_model = ImageSwingUpBatch(SwingUpBatch(dry_friction, jitter))
         low = np.repeat([0.0, -1.0], PIXELS**2)
         super().__init__(
             render_mode,

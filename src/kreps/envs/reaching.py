@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from kreps.envs.base import BatchEnvironment
 from kreps.envs.drawing import Canvas
-from kreps.envs.integration import runge_kutta
+from kreps.envs.integration import checked_jitter, control_periods, runge_kutta
 from kreps.kernels.arrays import BoolArray, FloatArray
 
 LINK = 0.5  # m, each
@@ -60,17 +61,33 @@ def wrap_angles(states: FloatArray) -> FloatArray:
     return states
 
 
+@dataclass(frozen=True)
 class ReachingBatch:
-    """The reaching task for m rollouts at once; see `kreps.envs.batch.BatchModel`."""
+    """The reaching task for m rollouts at once; see `kreps.envs.batch.BatchModel`.
+
+    States (m, 4) are angles and velocities, and with jitter the time since the start, (m, 5).
+
+    Attributes:
+        jitter: argument of `Reaching`.
+    """
+
+    jitter: float = 0.0
+
+    def __post_init__(self) -> None:
+        checked_jitter(self.jitter)
 
     def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
-        return np.tile(START, (len(rngs), 1))
+        return np.tile([*START, 0.0] if self.jitter else START, (len(rngs), 1))
 
     def observe(self, states: FloatArray) -> FloatArray:
-        return states
+        return states[:, :4]
+
+    def time_stamps(self, states: FloatArray) -> FloatArray | None:
+        return states[:, 4] if self.jitter else None
 
     def states_at(self, observations: FloatArray) -> FloatArray:
-        return wrap_angles(observations.copy())
+        start = np.zeros((len(observations), 1 if self.jitter else 0))
+        return wrap_angles(np.concatenate([observations, start], axis=1))
 
     def step(
         self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
@@ -80,8 +97,14 @@ class ReachingBatch:
         def derivative(s: FloatArray) -> FloatArray:
             return np.concatenate([s[:, 2:], accelerations(s, torques)], axis=1)
 
-        successors = runge_kutta(derivative, states, TIME_STEP, SUB_STEPS)
-        return wrap_angles(successors), reward(states, torques), np.zeros(len(rngs), dtype=bool)
+        moving = states[:, :4]
+        rewards, ends = reward(moving, torques), np.zeros(len(rngs), dtype=bool)
+        if not self.jitter:
+            return wrap_angles(runge_kutta(derivative, moving, TIME_STEP, SUB_STEPS)), rewards, ends
+        periods = control_periods(TIME_STEP, self.jitter, rngs)[:, None]
+        successors = runge_kutta(derivative, moving, periods, SUB_STEPS)
+        times = states[:, 4:] + periods
+        return np.concatenate([wrap_angles(successors), times], axis=1), rewards, ends
 
 
 class Reaching(BatchEnvironment):
@@ -134,6 +157,10 @@ class Reaching(BatchEnvironment):
 
     `render_mode`: `None` or `"rgb_array"`.
 
+    `jitter`: in [0, 1), 0 by default.  Each control period is drawn uniformly from
+    `(1 - jitter) dt` to `(1 + jitter) dt` with `dt = 0.05 s`; `info["time"]` has the time since
+    the start in s.  The reward of a step does not depend on it.
+
     ```python
     >>> import gymnasium as gym
     >>> import kreps
@@ -161,7 +188,9 @@ class Reaching(BatchEnvironment):
     }
     batch_model = ReachingBatch()
 
-    def __init__(self, render_mode: str | None = None) -> None:
+    def __init__(self, render_mode: str | None = None, jitter: float = 0.0) -> None:
+        if jitter:
+            self.batch_model = ReachingBatch(jitter)
         high = np.array([np.pi, np.pi, np.inf, np.inf])
         super().__init__(
             render_mode,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -11,7 +12,8 @@ from numpy.typing import NDArray
 
 from kreps.envs.base import BatchEnvironment
 from kreps.envs.drawing import Canvas
-from kreps.envs.integration import runge_kutta
+from kreps.envs.integration import checked_jitter, control_periods, runge_kutta
+from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import BoolArray, FloatArray
 
 MASS = 10.0  # kg
@@ -44,13 +46,42 @@ def integrate(
     torque: FloatArray,
     friction: float = FRICTION,
     sub_steps: int = SUB_STEPS,
+    period: float | FloatArray = TIME_STEP,
 ) -> tuple[FloatArray, FloatArray]:
     """Angle and velocity (m,) after one control period of constant torque (m,)."""
 
     def derivative(state: FloatArray) -> FloatArray:
         return np.stack([state[1], acceleration(state[0], state[1], torque, friction)])
 
-    theta, velocity = runge_kutta(derivative, np.stack([theta, velocity]), TIME_STEP, sub_steps)
+    theta, velocity = runge_kutta(derivative, np.stack([theta, velocity]), period, sub_steps)
+    return theta, velocity
+
+
+def integrate_with_dry_friction(
+    theta: FloatArray,
+    velocity: FloatArray,
+    torque: FloatArray,
+    dry_friction: float,
+    period: float | FloatArray = TIME_STEP,
+) -> tuple[FloatArray, FloatArray]:
+    """The same with Coulomb friction of ``dry_friction`` in N m, beside the viscous one.
+
+    At rest it balances all other torques up to its size, so that the pendulum sticks.  In motion it
+    has this size and opposes the motion, which it can end but not reverse.
+    """
+    for _ in range(SUB_STEPS):
+        driving = WEIGHT_TORQUE * np.sin(theta) + torque
+        direction = np.where(velocity == 0.0, np.sign(driving), np.sign(velocity))
+        sticks = (velocity == 0.0) & (np.abs(driving) <= dry_friction)
+        moved, speed = integrate(
+            theta,
+            velocity,
+            torque - dry_friction * direction,
+            sub_steps=1,
+            period=period / SUB_STEPS,
+        )
+        theta = np.where(sticks, theta, moved)
+        velocity = np.where(sticks | (speed * direction < 0.0), 0.0, speed)
     return theta, velocity
 
 
@@ -59,28 +90,60 @@ def reward(theta: FloatArray, velocity: FloatArray, torque: FloatArray) -> Float
     return -10.0 * theta**2 - 0.1 * velocity**2 - 1e-3 * torque**2
 
 
+@dataclass(frozen=True)
 class SwingUpBatch:
-    """The swing-up for m rollouts at once; see `kreps.envs.batch.BatchModel`."""
+    """The swing-up for m rollouts at once; see `kreps.envs.batch.BatchModel`.
+
+    States (m, 2) are angle and velocity, and with jitter the time since the start, (m, 3).
+
+    Attributes:
+        dry_friction, jitter: arguments of `SwingUp`.
+    """
+
+    dry_friction: float = 0.0
+    jitter: float = 0.0
+
+    def __post_init__(self) -> None:
+        checked_jitter(self.jitter)
+        if not 0.0 <= self.dry_friction < np.inf:
+            raise ConfigurationError(
+                f"dry_friction = {self.dry_friction!r:.60}, but a finite torque of at least 0 N m "
+                "is needed"
+            )
 
     def initial(self, rngs: Sequence[np.random.Generator]) -> FloatArray:
-        return np.tile([np.pi, 0.0], (len(rngs), 1))
+        return np.tile([np.pi, 0.0, 0.0] if self.jitter else [np.pi, 0.0], (len(rngs), 1))
 
     def observe(self, states: FloatArray) -> FloatArray:
-        return states
+        return states[:, :2]
+
+    def time_stamps(self, states: FloatArray) -> FloatArray | None:
+        return states[:, 2] if self.jitter else None
 
     def states_at(self, observations: FloatArray) -> FloatArray:
-        return np.stack([wrap_angle(observations[:, 0]), observations[:, 1]], axis=1)
+        columns = [wrap_angle(observations[:, 0]), observations[:, 1]]
+        return np.stack([*columns, 0.0 * columns[1]] if self.jitter else columns, axis=1)
 
     def step(
         self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        theta, velocity = states.T
+        theta, velocity = states.T[:2]
         torque = np.clip(actions[:, 0], -MAX_TORQUE, MAX_TORQUE)
         noise = NOISE * np.array([rng.standard_normal() for rng in rngs])
         rewards = reward(theta, velocity, torque)
-        theta, velocity = integrate(theta, velocity, torque + noise)
-        successors = np.stack([wrap_angle(theta), velocity], axis=1)
-        return successors, rewards, np.zeros(len(rngs), dtype=bool)
+        period: float | FloatArray = TIME_STEP
+        if self.jitter:
+            period = control_periods(TIME_STEP, self.jitter, rngs)
+        if self.dry_friction:
+            theta, velocity = integrate_with_dry_friction(
+                theta, velocity, torque + noise, self.dry_friction, period
+            )
+        else:
+            theta, velocity = integrate(theta, velocity, torque + noise, period=period)
+        columns = [wrap_angle(theta), velocity]
+        if self.jitter:
+            columns.append(states[:, 2] + period)
+        return np.stack(columns, axis=1), rewards, np.zeros(len(rngs), dtype=bool)
 
 
 class SwingUp(BatchEnvironment):
@@ -134,6 +197,13 @@ class SwingUp(BatchEnvironment):
 
     `render_mode`: `None` or `"rgb_array"`.
 
+    `dry_friction`: Coulomb friction at the joint in N m, 0 by default.  At rest it balances all
+    other torques up to its size; in motion it opposes the motion with its size.
+
+    `jitter`: in [0, 1), 0 by default.  Each control period is drawn uniformly from
+    `(1 - jitter) dt` to `(1 + jitter) dt` with `dt = 0.05 s`; `info["time"]` has the time since
+    the start in s.  Neither the noise on the torque nor the reward of a step depend on it.
+
     ```python
     >>> import gymnasium as gym
     >>> import kreps
@@ -156,7 +226,11 @@ class SwingUp(BatchEnvironment):
     }
     batch_model = SwingUpBatch()
 
-    def __init__(self, render_mode: str | None = None) -> None:
+    def __init__(
+        self, render_mode: str | None = None, dry_friction: float = 0.0, jitter: float = 0.0
+    ) -> None:
+        if dry_friction or jitter:
+            self.batch_model = SwingUpBatch(dry_friction, jitter)
         low, high = np.array([-0.5 * np.pi, -np.inf]), np.array([1.5 * np.pi, np.inf])
         super().__init__(
             render_mode,

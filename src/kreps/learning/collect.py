@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any, cast
 
 import gymnasium as gym
@@ -15,12 +16,13 @@ import numpy as np
 
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
-from kreps.envs.batch import BatchModel, SettableModel
+from kreps.envs.batch import BatchModel, SettableModel, time_stamps_of
 from kreps.envs.held_actions import held
 from kreps.envs.restart import restart_length, stratified_lengths
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, NumericalError
 from kreps.intake import as_array, as_flag, as_flags, as_number, as_numbers
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray, default_errstate, grid_points
+from kreps.learning.control_period import time_in, time_stamps
 from kreps.learning.environment import (
     Environment,
     batch_model_of,
@@ -256,10 +258,12 @@ def _simulate_batch(
     live = np.arange(len(rngs))
     lengths, terminated = np.zeros(len(live), np.intp), np.zeros(len(live), dtype=bool)
     steps: list[tuple[IntArray, FloatArray, FloatArray, FloatArray]] = []
+    stamps: list[FloatArray] = []  # empty where control periods are constant
     t = 0
     try:
         states = np.array(model.initial(rngs))
         current = first = _checked(model.observe(states), len(live), task)
+        start = time_stamps_of(model, states)
         while len(live):
             drawn = [next(rows[j], None) for j in live.tolist()]
             going = np.array([row is not None for row in drawn])
@@ -274,6 +278,8 @@ def _simulate_batch(
             )
             current = _checked(model.observe(states), len(live), task)
             steps.append((live, actions, rewards, current))
+            if start is not None:
+                stamps.append(np.array(time_stamps_of(model, states)))
             t += 1
             lengths[live] = t
             terminated[live[done]] = True
@@ -290,7 +296,10 @@ def _simulate_batch(
     )
     starts = np.cumsum(lengths) - lengths
     points = np.insert(successors, starts, first, axis=0)
-    return Rollouts.from_arrays(points, actions, rewards, lengths, terminated)
+    collected = Rollouts.from_arrays(points, actions, rewards, lengths, terminated)
+    if start is None:
+        return collected
+    return replace(collected, times=np.insert(np.concatenate(stamps)[order], starts, start))
 
 
 def _simulate_one(
@@ -306,14 +315,17 @@ def _simulate_one(
     observations: list[FloatArray] = []
     actions: list[FloatArray] = []
     rewards: list[float] = []
+    times: list[Any] = []
     terminated = False
     try:
-        observation, _ = env.reset(seed=seed)
+        observation, info = env.reset(seed=seed)
+        times.append(time_in(info))
         observations.append(_state(observation, task))
         for row in noise:
             with default_errstate():  # the environment keeps the caller's
                 action = policy.act(observations[-1][None], row[None])[0]
-            observation, reward, ended, cut, _ = env.step(spaces.actions(task.clip(action)))
+            observation, reward, ended, cut, info = env.step(spaces.actions(task.clip(action)))
+            times.append(time_in(info))
             observations.append(_state(observation, task))
             actions.append(action)
             rewards.append(as_number("reward", reward))
@@ -329,7 +341,13 @@ def _simulate_one(
     except Exception as error:
         raise _failure(error, f"rollout {number}", len(rewards)) from error
     try:
-        return Rollout(np.stack(observations), np.stack(actions), np.array(rewards), terminated)
+        return Rollout(
+            np.stack(observations),
+            np.stack(actions),
+            np.array(rewards),
+            terminated,
+            time_stamps(times),
+        )
     except DataError as error:
         raise DataError(f"rollout {number} of the environment: {error}") from error
 

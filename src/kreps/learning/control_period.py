@@ -1,11 +1,16 @@
-"""The control period of an environment, read where environments are known to tell it."""
+"""Control period and time stamps, read where environments are known to have them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from typing import Any
 
+import numpy as np
+
 from kreps.data.task import is_period
+from kreps.intake import MAX_MAGNITUDE
+from kreps.kernels.arrays import FloatArray
 from kreps.learning.wrappers import Environment, keeps_time, metadata_of, wrappers_of
 
 
@@ -37,3 +42,19 @@ def _tried(read: Callable[[], Any]) -> Any:
         return None if isinstance(value, str | bool | Mapping) else float(value)
     except Exception:
         return None
+
+
+def time_in(info: Any) -> Any:
+    """``info["time"]``, the time since the start of a rollout in s; None if there is none."""
+    return info.get("time") if isinstance(info, Mapping) else None
+
+
+def time_stamps(times: Sequence[Any]) -> FloatArray | None:
+    """The times (T + 1,) of the observations of a rollout in s, from `time_in` of each.
+
+    None unless they are finite and increasing numbers: in a foreign environment ``info["time"]``
+    may be anything.
+    """
+    if not all(isinstance(time, int | float) and abs(time) <= MAX_MAGNITUDE for time in times):
+        return None
+    return np.array(times, np.float64) if all(b > a for a, b in pairwise(times)) else None

@@ -13,7 +13,7 @@ import numpy as np
 
 from kreps.data.spaces import Spaces
 from kreps.data.task import TaskSpec
-from kreps.envs.batch import BatchModel
+from kreps.envs.batch import batch_model_of as batch_model_of
 from kreps.errors import ConfigurationError, SpaceError
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.control_period import control_period
@@ -191,24 +191,6 @@ def environment_for(
         )
     warn_about_state(env)
     return inside
-
-
-def batch_model_of(env: Environment) -> BatchModel | None:
-    """The vectorised form of an environment; None if it has none that computes the same.
-
-    A wrapper may change what a step does, so only wrappers that are known not to are looked
-    through.
-    """
-    transparent = (gym.wrappers.PassiveEnvChecker, gym.wrappers.OrderEnforcing)
-    while isinstance(env, transparent):
-        env = env.env
-    if "batch_model" in vars(env):
-        return cast(BatchModel, vars(env)["batch_model"])
-    for owner in type(env).__mro__:
-        if "batch_model" in vars(owner):  # a subclass with its own step or reset differs from it
-            same = all(getattr(type(env), n) is getattr(owner, n) for n in ("step", "reset"))
-            return cast(BatchModel, vars(owner)["batch_model"]) if same else None
-    return None
 
 
 def time_limit(env: Environment) -> int:

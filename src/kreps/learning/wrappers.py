@@ -9,6 +9,7 @@ from typing import Any
 import gymnasium as gym
 
 from kreps.envs.held_actions import HeldActions
+from kreps.envs.perturb import Perturbed
 from kreps.envs.restart import RandomRestart
 from kreps.errors import ConfigurationError
 
@@ -73,7 +74,7 @@ def keeps_time(wrapper: Wrapper) -> bool:
         return name not in CHANGES_TIME
     bases = (gym.Wrapper, gym.ActionWrapper, gym.ObservationWrapper, gym.RewardWrapper)
     own = type(wrapper).step
-    return isinstance(wrapper, RandomRestart) or any(own is base.step for base in bases)
+    return isinstance(wrapper, RandomRestart | Perturbed) or any(own is base.step for base in bases)
 
 
 def _gymnasium_name(wrapper: Wrapper) -> str:

@@ -239,6 +239,7 @@ class Record:
         given: fields that are not stored, but passed to `decode` as ``given``.
         ranges: smallest and largest possible size by letter.
         absent: what stands in the header for fields that files of before do not have.
+        omitted: fields that are left out of the header where they are None.
     """
 
     owner: type[Any]
@@ -246,6 +247,7 @@ class Record:
     given: tuple[str, ...] = ()
     ranges: Mapping[str, tuple[int, int]] = field(default_factory=dict)
     absent: Mapping[str, Any] = field(default_factory=dict)
+    omitted: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         assert {each.name for each in fields(self.owner)} == {*self.nodes, *self.given}
@@ -254,10 +256,11 @@ class Record:
         return {
             part: node.encode(getattr(value, part), _join(name, part), tensors)
             for part, node in self.nodes.items()
+            if part not in self.omitted or getattr(value, part) is not None
         }
 
     def check(self, header: Any, name: str, layout: Layout, sizes: Sizes) -> None:
-        header = {**self.absent, **header} if isinstance(header, dict) else header
+        header = self._filled(header) if isinstance(header, dict) else header
         found = sorted(header) if isinstance(header, dict) else header
         if found != sorted(self.nodes):
             raise StorageError(
@@ -273,12 +276,15 @@ class Record:
                 )
 
     def decode(self, header: Any, name: str, load: Load, given: Mapping[str, Any]) -> Any:
-        header = {**self.absent, **header}
+        header = self._filled(header)
         parts = {
             part: node.decode(header[part], _join(name, part), load, given)
             for part, node in self.nodes.items()
         }
         return self.owner(**parts, **{part: given[part] for part in self.given})
+
+    def _filled(self, header: dict[str, Any]) -> dict[str, Any]:
+        return {**dict.fromkeys(self.omitted), **self.absent, **header}
 
 
 def _join(name: str, part: str) -> str:

@@ -13,7 +13,15 @@ from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.errors import DataError, StorageError
 from kreps.learning.storage.atomic import given_path
-from kreps.learning.storage.codec import DATA, Array, Converted, Record, Sizes, Tensors
+from kreps.learning.storage.codec import (
+    DATA,
+    Array,
+    Converted,
+    Optional,
+    Record,
+    Sizes,
+    Tensors,
+)
 from kreps.learning.storage.files import (
     MAX_FILE_BYTES,
     NO_CHECKSUM,
@@ -32,8 +40,9 @@ def _checked(rollouts: Rollouts, given: Mapping[str, Any]) -> Rollouts:
         raise StorageError(
             f"the offsets of its rollouts do not increase from 0 to {n}, its number of steps"
         )
-    for values in (rollouts.points, rollouts.actions, rollouts.rewards):
-        values.flags.writeable = False
+    for values in (rollouts.points, rollouts.actions, rollouts.rewards, rollouts.times):
+        if values is not None:
+            values.flags.writeable = False
     return rollouts
 
 
@@ -46,7 +55,9 @@ ROLLOUTS = Converted(
             "offsets": Array(("R+1",), dtype="I64"),
             "points": Array(("n+R", "ds"), DATA),
             "actions": Array(("n", "da"), DATA),
+            "times": Optional(Array(("n+R",), DATA)),
         },
+        omitted=("times",),
     ),
     lambda rollouts: rollouts,
     _checked,
