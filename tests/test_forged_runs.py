@@ -19,11 +19,11 @@ import pytest
 import kreps
 from kreps.algorithms.dual import Outcome
 from kreps.app import cli
-from kreps.app.lock import locked
 from kreps.app.progress_file import ADDED_COLUMNS, COLUMNS, read_progress
 from kreps.app.report import diagnosis_of
 from kreps.app.run_folder import RunFolder
 from kreps.errors import StorageError
+from kreps.learning.storage.lock import locked
 
 NAME = "kreps/SwingUp-v0"
 TINY = ["--no-report", "--set", "initial_rollouts=6", "--set", "rollouts_per_iteration=3"]

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from kreps.app.lock import locked
 from kreps.app.progress_file import progress_row, progress_text, read_progress
 from kreps.data.rollouts import Rollouts
 from kreps.data.window import ReplayWindow
@@ -25,6 +24,7 @@ from kreps.learning.episodes import EpisodicReturn
 from kreps.learning.iteration import IterationReport
 from kreps.learning.methods import KREPS
 from kreps.learning.storage import load_rollouts, remove_parts, save_policy, write_atomically
+from kreps.learning.storage.lock import locked
 from kreps.legacy import present_preset, present_settings
 from kreps.versions import versions
 
