@@ -18,9 +18,10 @@ from kreps.envs.restart import stratified_lengths
 from kreps.envs.swing_up import SwingUp
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, SpaceError
 from kreps.kernels.arrays import FloatArray
-from kreps.learning.collect import collect, longest_rollout, simulate
+from kreps.learning.collect import collect, simulate
 from kreps.learning.environment import batch_model_of, task_of
 from kreps.learning.evaluate import discounted_average
+from kreps.learning.planning import longest_rollout
 from kreps.learning.wrappers import without_restarts
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.exploration import RED, BangBang

@@ -1,7 +1,7 @@
 """Collection of rollouts: in batches if the environment has a batch model, otherwise step by step.
 
-Random numbers of a rollout are addressed by its number and those of stratified lengths by the
-iteration, so that both ways give the same data from the same seed.
+Rollouts are planned before they are made (`kreps.learning.planning`), so that both ways give the
+same data from the same seed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.envs.batch import BatchModel, SettableModel, time_stamps_of
 from kreps.envs.held_actions import held
-from kreps.envs.restart import restart_length, stratified_lengths
 from kreps.errors import ConfigurationError, DataError, EnvironmentFailure, NumericalError
 from kreps.intake import as_array, as_flag, as_flags, as_number, as_numbers
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray, default_errstate, grid_points
@@ -30,19 +29,10 @@ from kreps.learning.environment import (
     spaces_of,
     time_limit,
 )
+from kreps.learning.planning import PlannedRollout, longest_rollout, planned_rollouts
 from kreps.policies.base import StochasticPolicy
-from kreps.policies.exploration import WHITE, noise_rows
-from kreps.seeding import Purpose, generator, integer_seed
-
-MAX_BYTES = 2**30
-"""Largest size of a batch of rollouts while it is collected."""
-
-BYTES_PER_STEP = 400
-"""Size of a step beside its numbers."""
-
-MAX_EPISODE = 10_000
-"""Largest number of steps of a rollout in a batch that would be larger, and in which therefore only
-the environment can end a rollout."""
+from kreps.policies.exploration import WHITE
+from kreps.seeding import Purpose, generator
 
 
 def collect(
@@ -79,34 +69,36 @@ def collect(
         EnvironmentFailure: the environment raised an exception.
         DataError: it returned NaN, infinities or observations of another size.
     """
-    numbers = range(first, first + count)
-    seeds = [integer_seed(seed, Purpose.ENVIRONMENT, iteration, j) for j in numbers]
-    rngs = [generator(seed, Purpose.POLICY, iteration, j) for j in numbers]
-    limit = -(-time_limit(env) // task.action_repeat)  # decisions
-    if stratified:
-        rng = generator(seed, Purpose.RESTART, iteration, *([first] if first else ()))
-        drawn = stratified_lengths(rng, restart_probability, count)
-    else:
-        drawn = [restart_length(generator(s, Purpose.RESTART), restart_probability) for s in seeds]
-    lengths = [min(length, limit) for length in drawn]
-    noises = [
-        noise_rows(exponent, length, task.action_size, rng)
-        for length, rng in zip(lengths, rngs, strict=True)
-    ]
-    limit = longest_rollout(lengths, task)
-    return simulate(env, task, policy, seeds, noises, on_rollout, limit)
+    planned = planned_rollouts(
+        count,
+        seed=seed,
+        iteration=iteration,
+        first=first,
+        restart_probability=restart_probability,
+        stratified=stratified,
+        exponent=exponent,
+        decisions=decisions_in(env, task),
+    )
+    return collect_planned(env, task, policy, planned, on_rollout)
 
 
-def longest_rollout(lengths: Sequence[int], task: TaskSpec) -> int:
-    """Largest number of steps that a rollout may have, so that the batch fits in memory.
+def decisions_in(env: Environment, task: TaskSpec) -> int:
+    """Largest number of decisions in an episode of an environment, by its time limit."""
+    return -(-time_limit(env) // task.action_repeat)
 
-    Args:
-        lengths: (R,) of the rollouts, unless the environment ends them before.
-        task: how wide a step is.
-    """
-    numbers = task.observation_size + task.action_size + 1
-    steps = MAX_BYTES // (8 * numbers + BYTES_PER_STEP)
-    return max(lengths) if sum(lengths) <= steps else min(MAX_EPISODE, steps // len(lengths))
+
+def collect_planned(
+    env: Environment,
+    task: TaskSpec,
+    policy: StochasticPolicy,
+    planned: Sequence[PlannedRollout],
+    on_rollout: Callable[[int], None] | None = None,
+) -> Rollouts:
+    """The rollouts that are planned, by one policy; arguments and errors as of `collect`."""
+    seeds = [each.seed for each in planned]
+    noises = [each.noise(task.action_size) for each in planned]
+    longest = longest_rollout([each.length for each in planned], task)
+    return simulate(env, task, policy, seeds, noises, on_rollout, longest)
 
 
 def collect_grid(
@@ -320,13 +312,13 @@ def _simulate_one(
     try:
         observation, info = env.reset(seed=seed)
         times.append(time_in(info))
-        observations.append(_state(observation, task))
+        observations.append(as_state(observation, task))
         for row in noise:
             with default_errstate():  # the environment keeps the caller's
                 action = policy.act(observations[-1][None], row[None])[0]
             observation, reward, ended, cut, info = env.step(spaces.actions(task.clip(action)))
             times.append(time_in(info))
-            observations.append(_state(observation, task))
+            observations.append(as_state(observation, task))
             actions.append(action)
             rewards.append(as_number("reward", reward))
             _require_end(len(rewards), longest)
@@ -383,7 +375,7 @@ def _step(
     return successors, _of_shape("rewards", rewards, rows), done
 
 
-def _state(observation: Any, task: TaskSpec) -> FloatArray:
+def as_state(observation: Any, task: TaskSpec) -> FloatArray:
     """An observation as a vector (ds,) of finite numbers."""
     state = as_numbers("observations", observation, "repair what measures it").ravel()
     if len(state) != task.observation_size:

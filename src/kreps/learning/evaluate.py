@@ -16,8 +16,9 @@ import numpy as np
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray, default_errstate
-from kreps.learning.collect import longest_rollout, simulate
+from kreps.learning.collect import simulate
 from kreps.learning.episodes import EpisodicReturn
+from kreps.learning.planning import longest_rollout
 from kreps.learning.wrappers import Environment, without_restarts
 from kreps.policies.base import LearntPolicy, StochasticPolicy
 from kreps.policies.exploration import WHITE, noise_rows

@@ -211,31 +211,41 @@ class Learner(Generic[MethodSettings]):
     ) -> Self:
         assert self.env is not None
         for _ in range(iterations):
-            started, before = time.process_time(), self.state.steps
+            started = time.process_time()
             with blas_threads(self.threads, exact=True), enough_memory("collecting rollouts"):
                 collected, taken = self._collected(self.env, on_rollout)
-            seconds = time.process_time() - started
-            probability, repeat = self.restart_probability, self.task.action_repeat
-            rollouts, explorer_share = collected.of_acting, collected.explorer_share
-            lower, upper = rollouts.reward_quartiles()
-            info = self.update(collected.rollouts)
-            self.state = replace(self.state, steps=before + taken)
-            report = IterationReport(
-                iteration=self.state.iteration,
-                rollouts=self.state.rollouts,
-                steps=self.state.steps,
-                average_reward=float(rollouts.rewards.sum()) / (taken * (1.0 - explorer_share)),
-                mean_return=float(rollouts.rewards.sum()) / len(rollouts),
-                terminated=float(rollouts.terminated.mean()),
-                reward_quartiles=(lower / repeat, upper / repeat),
-                explorer_share=explorer_share,
-                update=info,
-                rollout_seconds=seconds,
-                restart_probability=probability,
-            )
+            report = self._learnt_from(collected, taken, time.process_time() - started)
             if any([is_false(each(self, report)) for each in callbacks]):
                 break
         return self
+
+    def _learnt_from(self, collected: Collected, taken: int, seconds: float) -> IterationReport:
+        """Update from the rollouts of an iteration.
+
+        Args:
+            collected: the rollouts.
+            taken: steps of the environment that they took.
+            seconds: of CPU time that they took.
+        """
+        before = self.state.steps
+        probability, repeat = self.restart_probability, self.task.action_repeat
+        rollouts, explorer_share = collected.of_acting, collected.explorer_share
+        lower, upper = rollouts.reward_quartiles()
+        info = self.update(collected.rollouts)
+        self.state = replace(self.state, steps=before + taken)
+        return IterationReport(
+            iteration=self.state.iteration,
+            rollouts=self.state.rollouts,
+            steps=self.state.steps,
+            average_reward=float(rollouts.rewards.sum()) / (taken * (1.0 - explorer_share)),
+            mean_return=float(rollouts.rewards.sum()) / len(rollouts),
+            terminated=float(rollouts.terminated.mean()),
+            reward_quartiles=(lower / repeat, upper / repeat),
+            explorer_share=explorer_share,
+            update=info,
+            rollout_seconds=seconds,
+            restart_probability=probability,
+        )
 
     def update(self, rollouts: Iterable[Rollout]) -> UpdateReport:
         """One update from new rollouts, collected anywhere, and those that the window has kept.

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from kreps.kernels.arrays import default_errstate
-from kreps.learning.batches import Collected, batch_size, collect_batch
+from kreps.learning.batches import BatchPlan, Collected, batch_size, collect_batch
 from kreps.learning.environment import Environment
 from kreps.learning.learner import Learner
 from kreps.policies.base import StochasticPolicy
@@ -23,19 +23,21 @@ class OnPolicyLearner(Learner[OnPolicy]):
     """
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Collected:
+        return collect_batch(env, self.task, self._batch_plan(), on_rollout)
+
+    def _batch_plan(self) -> BatchPlan:
+        """What the rollouts of the next iteration will be."""
         policy, exponent = self._collecting_policy()
+        settings, iteration = self.update_settings, self.state.iteration
         decisions = self.state.steps / self.task.action_repeat
         explorer = None if self.exploring else self.state.explorer
-        return collect_batch(
-            env,
-            self.task,
-            [policy] if explorer is None else [policy, explorer],
-            batch_size(self.update_settings, self.state.iteration, decisions),
-            self.update_settings,
-            seed=self.seed,
-            iteration=self.state.iteration,
+        return BatchPlan(
+            policies=(policy,) if explorer is None else (policy, explorer),
             exponent=exponent,
-            on_rollout=on_rollout,
+            size=batch_size(settings, iteration, decisions),
+            settings=settings,
+            seed=self.seed,
+            iteration=iteration,
         )
 
     @property
