@@ -14,7 +14,7 @@ import kreps
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("--folder", default="runs/robot", help="of the session; it goes on there")
-parser.add_argument("--updates", type=int, default=17, help="in all; 17 need some 5,000 cycles")
+parser.add_argument("--updates", type=int, default=13, help="in all; 13 need some 5,000 cycles")
 parser.add_argument("--seed", type=int, default=0)
 parser.add_argument("--speed", type=float, default=1.0, help="simulated seconds per second")
 args = parser.parse_args()

@@ -187,7 +187,7 @@ def test_a_session_that_is_killed_loses_at_most_one_rollout(tmp_path: Path, whol
             finally:
                 os._exit(0)
         os.close(writer)
-        seen, most = b"", rng.integers(5, 40)
+        seen, most = b"", rng.integers(3, 20)
         while len(seen) < most and (new := os.read(reader, 1)):
             seen += new
         time.sleep(rng.uniform(0.0, 0.03))  # also into an update
@@ -363,6 +363,8 @@ def test_leaving_the_block_in_a_rollout_stops_the_robot(tmp_path: Path) -> None:
     session = ours.session(tmp_path, stop=lambda action: sent.append(float(action[0])))
     with pytest.raises(ConfigurationError, match="no rollout has begun"):
         session.act([0.0, 0.0])
+    with pytest.raises(ConfigurationError, match="the session is not open"):
+        next(session.rollouts(1, progress=False))
     with pytest.raises(ZeroDivisionError), session as robot:
         next(robot.rollouts(1))
         robot.act([0.0, 0.0])

@@ -52,8 +52,9 @@ class Learner(Generic[MethodSettings]):
 
     Args:
         env: a Gymnasium environment with Box observations and bounded Box actions, or a
-            `TaskSpec` if all data comes through `update`.  The learner restarts the environment at
-            random as in the paper (Sec. 4.1), so its episodes need not end.
+            `TaskSpec` if all data comes through `update` or from a robot (`session`).  The learner
+            restarts the environment at random as in the paper (Sec. 4.1), so its episodes need not
+            end.
         seed: of all random numbers; the same seed gives the same policy, byte for byte.
         periodic: coordinates of the observation that are angles in rad; None takes them from
             ``env.metadata["periodic_coordinates"]``, unless a wrapper may change observations.
@@ -191,7 +192,8 @@ class Learner(Generic[MethodSettings]):
         if self.env is None:
             raise ConfigurationError(
                 "this learner was made from a TaskSpec and has no environment to collect rollouts "
-                "in; pass rollouts to update(), or make the learner from an environment"
+                "in; pass rollouts to update(), learn on a robot in a session(), or make the "
+                "learner from an environment"
             )
         iterations = _whole_number("iterations", iterations)
         callbacks = callbacks_of(callback)

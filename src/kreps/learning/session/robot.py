@@ -86,7 +86,7 @@ class RobotSession:
         self._lock = RLock()  # of the rollout and its pace, which the watchdog's thread may end
         self._rollout: RolloutInProgress | None = None
         self._pace = Pace(period)
-        self._open = ExitStack()
+        self._open: ExitStack | None = None
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
@@ -103,8 +103,9 @@ class RobotSession:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        assert self._open is not None
         with self._open, self._lock:
-            rollout, self._rollout = self._rollout, None
+            rollout, self._rollout, self._open = self._rollout, None, None
             if rollout is not None and rollout.end is not None:
                 self._recorded(rollout)
             elif rollout is not None and rollout.acting and self._stop is not None:
@@ -182,6 +183,11 @@ class RobotSession:
                 return Collected(rollouts, done.value), sum(each.cycles for each in made)
 
     def _begin(self, policy: StochasticPolicy, planned: PlannedRollout) -> None:
+        if self._open is None:
+            raise ConfigurationError(
+                "the session is not open; write `with learner.session(...) as robot:` and loop "
+                "over its rollouts inside that block"
+            )
         task = self._learner.task
         # what the policy computes once is computed now, so that the first action is not late
         with default_errstate():

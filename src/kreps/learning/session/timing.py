@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import traceback
 from collections.abc import Callable
 from threading import Event, Thread
 from typing import Protocol
@@ -86,6 +87,8 @@ class Pace:
 class Watchdog:
     """A thread that calls ``check`` as soon as it may be due.
 
+    An error of ``check`` is printed, and the watch goes on.
+
     Args:
         check: returns the seconds after which to call it again; it must not be due earlier.
         clock: that waits.
@@ -99,7 +102,12 @@ class Watchdog:
 
     def _run(self) -> None:
         while not self._closed.is_set():
-            self._clock.sleep(self._check())
+            try:
+                left = self._check()
+            except Exception:  # of the user's function that stops the robot
+                traceback.print_exc()
+                continue
+            self._clock.sleep(left)
 
     def close(self) -> None:
         """Do not call ``check`` any more, and wait until the thread has ended."""
