@@ -305,6 +305,7 @@ def test_a_robot_that_never_answers_is_an_error(
             next(turns)
 
 
+@pytest.mark.filterwarnings("ignore::kreps.errors.DataWarning")
 def test_a_stuck_robot_is_stopped_within_two_periods(tmp_path: Path) -> None:
     code = "import time\nwhile True:\n    print(0.0, flush=True)\n    time.sleep(0.05)"
     stopped, when = threading.Event(), [0.0]
@@ -394,6 +395,7 @@ def test_a_session_that_makes_no_sense_is_refused(arguments: dict[str, Any], say
 # ---- the example --------------------------------------------------------------------------------
 
 
+@pytest.mark.filterwarnings("ignore::kreps.errors.DataWarning")
 @pytest.mark.slow
 def test_the_example_learns_from_a_robot_in_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
