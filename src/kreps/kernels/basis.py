@@ -7,12 +7,14 @@ With features phi the value function is ``V(s) = phi(s)' theta`` and its squared
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import Array, FloatArray, default_errstate, like
+from kreps.kernels.gram import gaussian_gram
 from kreps.kernels.kernel import Factor, Kernel, Periodic
 from kreps.kernels.linalg import solve_lower, solve_lower_transposed
 from kreps.kernels.pivoted_cholesky import pivoted_gaussian_gram
@@ -63,9 +65,14 @@ class KernelExpansion:
     centres: FloatArray
     alpha: FloatArray
 
+    @cached_property
+    def coordinates(self) -> FloatArray:
+        """Embedded centres (r, e), which model rollouts need in every step."""
+        return self.kernel.embed(self.centres)
+
     @default_errstate()
     def __call__(self, states: Array) -> Array:
-        k = self.kernel.gram(like(self.centres, states), states)
+        k = gaussian_gram(like(self.coordinates, states), self.kernel.embed(states))
         return k.T @ like(self.alpha, states)
 
 
