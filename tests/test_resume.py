@@ -23,9 +23,12 @@ BATCHES: dict[str, Any] = {
     "initial_rollouts": 6,
     "rollouts_per_iteration": 3,
     "growth": 0.0,
-    "window": 6,
+    "window": 12,
+    "window_steps": 0,
+    "restart_probability": 0.1,
 }
-TINY = BATCHES | {"model_based.improvement_steps": 2}
+TINY = BATCHES | {"model_based.improvement_steps": 1, "model_based.acceptance_rollouts": 10}
+"""In the first four updates a rollout is forgotten and a policy is rejected."""
 NAME = "kreps/SwingUp-v0"
 COMMAND = [sys.executable, "-m", "kreps"]
 SETTINGS = [part for name, value in TINY.items() for part in ("--set", f"{name}={value}")]
@@ -77,11 +80,13 @@ def assert_same_run(run: Path, other: Path, iterations: int) -> None:
     assert leftovers == set()
 
 
-@pytest.fixture(scope="module")
-def ten_in_one_go(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    run = tmp_path_factory.mktemp("reference") / "ten"
-    call(train(run, 10))
-    return run
+def untouched(path: Path, iterations: int) -> Path:
+    """The folder of a run that learns in this process, without a stop."""
+    run = RunFolder(path / "untouched")
+    run.create(RunConfig(NAME, iterations, 3, "model_based", TINY, None))
+    learner = kreps.KREPS(gym.make(NAME), seed=3, **TINY)
+    learner.learn(iterations, callback=run, progress=False)
+    return run.path
 
 
 # ---- in one process ---------------------------------------------------------------------------
@@ -195,16 +200,14 @@ def test_a_checkpoint_is_written_after_every_iteration(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_five_iterations_and_five_more_in_another_process_are_ten(
-    tmp_path: Path, ten_in_one_go: Path
-) -> None:
+def test_five_iterations_and_five_more_in_another_process_are_ten(tmp_path: Path) -> None:
     run = tmp_path / "run"
     call(train(run, 5))
     assert len(rows(run)) == 5
     half = (run / "policy.safetensors").read_bytes()
     call(resume(run, 10))
     assert half != (run / "policy.safetensors").read_bytes()
-    assert_same_run(run, ten_in_one_go, 10)
+    assert_same_run(run, untouched(tmp_path, 10), 10)
 
 
 @pytest.mark.slow
@@ -222,14 +225,11 @@ def test_ctrl_c_leaves_a_run_that_can_be_resumed(tmp_path: Path) -> None:
     total = len(rows(run)) + 2
     assert total >= 4  # the third may have been shown but not yet written
     call(resume(run, total))
-    untouched = RunFolder(tmp_path / "untouched")
-    untouched.create(RunConfig(NAME, total, 3, "model_based", TINY, None))
-    kreps.KREPS(gym.make(NAME), seed=3, **TINY).learn(total, callback=untouched, progress=False)
-    assert_same_run(run, untouched.path, total)
+    assert_same_run(run, untouched(tmp_path, total), total)
 
 
 @pytest.mark.slow
-def test_a_run_killed_at_twenty_random_moments_gives_the_bytes_of_an_untouched_one(
+def test_a_run_killed_at_ten_random_moments_gives_the_bytes_of_an_untouched_one(
     tmp_path: Path,
 ) -> None:
     rng = np.random.default_rng(20)
@@ -238,7 +238,7 @@ def test_a_run_killed_at_twenty_random_moments_gives_the_bytes_of_an_untouched_o
     call([*COMMAND, "--help"])
     start_up = time.perf_counter() - began  # on this machine, as busy as it is
     learnt = [0]
-    for kill in range(20):
+    for kill in range(10):
         resuming = (run / "config.json").exists()
         process = start(resume(run, forever) if resuming else train(run, forever))
         assert process.stdout is not None
@@ -257,10 +257,9 @@ def test_a_run_killed_at_twenty_random_moments_gives_the_bytes_of_an_untouched_o
         learnt.append(len(rows(run)) if (run / "progress.csv").exists() else 0)
     progress = np.diff(learnt)
     assert (progress >= 0).all()  # nothing was lost,
-    assert (progress == 0).sum() >= 2  # some were killed before they had done anything
-    assert (progress > 0).sum() >= 10  # and most in the midst of it
+    assert (progress == 0).sum() >= 1  # some were killed before they had done anything
+    assert (progress > 0).sum() >= 5  # and most in the midst of it
     done = learnt[-1]
     total = done + 2
     call(resume(run, total))
-    call(train(tmp_path / "untouched", total))
-    assert_same_run(run, tmp_path / "untouched", total)
+    assert_same_run(run, untouched(tmp_path, total), total)
