@@ -28,12 +28,13 @@ from kreps.learning.evaluate import Greedy, evaluate
 from kreps.policies.sparse_gp import SparseGP
 
 NAME = "kreps/SwingUp-v0"
-TINY = [
-    part
-    for setting in ("initial_rollouts=6", "rollouts_per_iteration=3", "window=6")
-    for part in ("--set", setting)
-]
-TINY_NAMES = {"initial_rollouts", "rollouts_per_iteration", "window"}
+SETTINGS = {
+    "initial_rollouts": 6,
+    "rollouts_per_iteration": 3,
+    "window": 6,
+    "restart_probability": 0.1,
+}
+TINY = [part for name, value in SETTINGS.items() for part in ("--set", f"{name}={value}")]
 RUN_FILES = {"config.json", "progress.csv", "checkpoint.safetensors", "policy.safetensors"}
 
 
@@ -169,7 +170,7 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path) -> No
     assert config["environment"] == NAME
     assert config["iterations"] == 2 and config["seed"] == 0
     assert config["preset"] == "model_based" and "recipe" not in config
-    assert config["settings"] == {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
+    assert config["settings"] == SETTINGS
     assert config["versions"]["numpy"] == np.__version__
     with (trained / "progress.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
@@ -185,9 +186,7 @@ def test_a_run_folder_holds_what_is_needed_to_understand_it(trained: Path) -> No
 
 
 def test_the_command_line_learns_what_the_library_learns(trained: Path, tmp_path: Path) -> None:
-    learner = kreps.KREPS(
-        gym.make(NAME), seed=0, initial_rollouts=6, rollouts_per_iteration=3, window=6
-    )
+    learner = kreps.KREPS(gym.make(NAME), seed=0, **SETTINGS)
     learner.learn(2, progress=False).policy.save(tmp_path / "policy")
     assert (tmp_path / "policy").read_bytes() == (trained / "policy.safetensors").read_bytes()
 
@@ -211,7 +210,8 @@ def test_a_whole_training_leaves_all_promised_files_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, text = call("train", NAME, "--iterations", "2", "--out", "run", *TINY)
+    few = ["--set", "initial_rollouts=6", "--set", "model_based.improvement_steps=1"]
+    code, text = call("train", NAME, "--iterations", "2", "--out", "run", *few)
     assert code == 0
     pictures = {"learning_curve.png", "policy_maps.png", "trajectories.png", "video.gif"}
     evaluated = {"evaluation.json", "evaluation_rollouts.safetensors"}
@@ -327,7 +327,7 @@ def test_settings_reach_the_learner(
     settings = kreps.KREPS.resume(tmp_path / "checkpoint.safetensors").settings
     assert {name: getattr(settings, name) for name in expected} == expected
     stored = json.loads((tmp_path / "config.json").read_text())["settings"]
-    assert set(stored) == {option.split("=")[0] for option in options} | TINY_NAMES
+    assert set(stored) == {option.split("=")[0] for option in options} | set(SETTINGS)
 
 
 def test_the_help_of_train_names_every_setting() -> None:
@@ -434,7 +434,7 @@ def test_evaluate_measures_both_policies(run: Path) -> None:
             learner.env,
             learner.task,
             acting,
-            restart_probability=0.02,
+            restart_probability=0.1,
             episodes=20,
             steps=60,
             seed=4,

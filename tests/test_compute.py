@@ -165,6 +165,7 @@ def learnt(given: Dataset | list[Rollout], executor: Executor | None, path: Path
         value=kreps.RKHS(max_rank=60),
         low_rank=kreps.LowRank(rank=60, above=0, subsample=200),
         compute=Compute(executor, chunk_size=CHUNK_SIZE),
+        **{"model_based.improvement_steps": 1},
     )
     learner.update(given)
     learner.save(path)

@@ -1042,7 +1042,8 @@ def test_a_damaged_checkpoint_leaves_out_what_is_about_samples(call: Call, tmp_p
 
 def test_samples_are_read_from_the_checkpoint(tmp_path: Path) -> None:
     run = write_run(tmp_path / "run", rows())
-    learner = kreps.KREPS(gym.make(NAME), initial_rollouts=6).learn(1, progress=False)
+    learner = kreps.KREPS(gym.make(NAME), initial_rollouts=6, model_based=None)
+    learner.learn(1, progress=False)
     learner.save(run / "checkpoint.safetensors")
     found = {f.name: f for f in report.diagnosis_of(RunFolder(run))}
     assert "None of the 2 observation columns" in found["idle columns"].sentence

@@ -21,7 +21,7 @@ from kreps.learning.evaluate import Evaluation
 from kreps.learning.storage import load_policy
 
 SMALL = ["--set", "initial_rollouts=6", "--set", "restart_probability=0.1"]
-SMALL += ["--set", "model_based.acceptance_rollouts=2"]
+SMALL += ["--set", "model_based.acceptance_rollouts=2", "--set", "model_based.improvement_steps=1"]
 
 
 class Point(gym.Env[Any, Any]):

@@ -13,7 +13,12 @@ import kreps
 from kreps.errors import EnvironmentFailure
 from kreps.learning.evaluate import evaluate
 
-SMALL: dict[str, Any] = {"seed": 0, "initial_rollouts": 6, "rollouts_per_iteration": 3}
+SMALL: dict[str, Any] = {
+    "seed": 0,
+    "initial_rollouts": 6,
+    "rollouts_per_iteration": 3,
+    "restart_probability": 0.1,
+}
 
 
 class Watched(gym.Wrapper[Any, Any, Any, Any]):

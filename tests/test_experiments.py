@@ -42,7 +42,12 @@ from kreps.experiments.trials import (
 from kreps.learning.methods import LEARNERS
 from kreps.presets import flat
 
-TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
+TINY = {
+    "initial_rollouts": 6,
+    "rollouts_per_iteration": 3,
+    "window": 6,
+    "restart_probability": 0.1,
+}
 
 
 def tiny(seed: int, method: str = "kernel REPS", **options: Any) -> Trial:

@@ -77,12 +77,14 @@ def test_differences_of_rewards_count_from_two_ten_millionths_of_the_largest() -
 
 @pytest.mark.parametrize("name", ["kreps/SwingUp-v0", "kreps/Reaching-v0", "Pendulum-v1"])
 def test_one_rollout_of_a_dense_reward_depends_on_the_state(name: str) -> None:
-    learner = kreps.KREPS(gym.make(name), initial_rollouts=1, rollouts_per_iteration=1)
+    learner = kreps.KREPS(gym.make(name), initial_rollouts=1, model_based=None)
     learner.learn(1, progress=False)
     assert reward_depends_on_state(learner.state.window.rollouts, learner.task)
 
 
 TINY: dict[str, Any] = {"initial_rollouts": 4, "rollouts_per_iteration": 2, "window": 4}
+LIGHT: dict[str, Any] = {"model_based.improvement_steps": 1, "model_based.acceptance_rollouts": 5}
+SHORT: dict[str, Any] = {**TINY, **LIGHT, "restart_probability": 0.02}
 
 
 @pytest.mark.parametrize("method", [kreps.KREPS, kreps.ValueIteration, kreps.NPALP])
@@ -98,7 +100,7 @@ def test_red_noise_at_the_limits_until_the_reward_depends_on_the_state(method: A
 
 
 def test_one_rollout_that_reaches_the_goal_ends_the_exploration() -> None:
-    learner = kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **TINY)
+    learner = kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **SHORT)
     learner.learn(1, progress=False)
     seen = learner.state.window.rollouts[0]
     rewards = np.where(np.arange(len(seen)) == len(seen) - 1, 100.0, seen.rewards)
@@ -120,7 +122,8 @@ def test_pink_noise_swings_the_rod_up_more_often_than_white_noise() -> None:
         shares = []
         for seed in (161, 162, 163, 164):
             env = gym.make("kreps/SwingUp-v0")
-            learner = kreps.KREPS(env, seed=seed, exploration=kreps.Exploration(noise))
+            noisy = kreps.Exploration(noise)
+            learner = kreps.KREPS(env, seed=seed, exploration=noisy, model_based=None)
             learner.learn(1, progress=False)
             angles = learner.state.window.rollouts.points[:, 0]
             shares.append(float(np.mean(np.abs(angles) < 0.5)))
@@ -132,7 +135,8 @@ def test_pink_noise_swings_the_rod_up_more_often_than_white_noise() -> None:
 def test_the_same_seed_gives_the_same_first_rollouts() -> None:
     def actions() -> np.ndarray:
         pink = kreps.Exploration("pink")
-        learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=5, exploration=pink, **TINY)
+        env = gym.make("kreps/SwingUp-v0")
+        learner = kreps.KREPS(env, seed=5, exploration=pink, model_based=None, **TINY)
         learner.learn(1, progress=False)
         return learner.state.window.rollouts.actions
 
@@ -159,7 +163,7 @@ def test_rollouts_that_are_too_short_to_decide_do_not_count_as_uninformative() -
     for steps in (1, 6):
         longer = window.append([rollout(COST, steps=steps)])
         assert longer.informative == (True, True, True, False) and longer.all_informative
-    learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=0)
+    learner = kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=0, model_based=None)
     learner.learn(1, progress=False)
     assert learner.state.window.all_informative
 
@@ -217,9 +221,8 @@ def test_the_newest_are_as_many_as_are_not_reserved(capacity: int | None, count:
 
 
 def test_it_explores_again_while_only_a_reserved_rollout_reached_the_goal() -> None:
-    learner = kreps.KREPS(
-        gym.make("MountainCarContinuous-v0"), seed=1, **TINY | {"window": 6, "window_steps": 0}
-    )
+    few = SHORT | {"window": 6, "window_steps": 0}
+    learner = kreps.KREPS(gym.make("MountainCarContinuous-v0"), seed=1, **few)
     learner.learn(1, progress=False)
     seen = learner.state.window.rollouts[0]
     rewards = np.where(np.arange(len(seen)) == len(seen) - 1, 100.0, seen.rewards)
@@ -263,21 +266,20 @@ class Tuning(gym.Env[Any, Any]):
         )
 
 
-@pytest.mark.parametrize("terminates", [False, True])
-@pytest.mark.parametrize("steps", [1, 3])
 @pytest.mark.parametrize(
-    ("reward", "best"),
+    ("reward", "best", "steps", "terminates"),
     [
-        (lambda a: -((a - 0.7) ** 2), 0.7),
-        (lambda a: -((a - 0.1) ** 2), 0.1),
-        (lambda a: -abs(a + 0.3), -0.3),
-        (lambda a: np.exp(-((a - 0.2) ** 2) / 0.1), 0.2),
+        (lambda a: -((a - 0.7) ** 2), 0.7, 3, False),
+        (lambda a: -((a - 0.1) ** 2), 0.1, 1, True),
+        (lambda a: -abs(a + 0.3), -0.3, 1, False),
+        (lambda a: np.exp(-((a - 0.2) ** 2) / 0.1), 0.2, 3, True),
     ],
 )
 def test_the_best_action_is_found_if_the_reward_is_of_the_action_alone(
     reward: Any, best: float, steps: int, terminates: bool
 ) -> None:
-    learner = kreps.KREPS(Tuning(reward, steps, terminates), seed=0).learn(20, progress=False)
+    env = Tuning(reward, steps, terminates)
+    learner = kreps.KREPS(env, seed=0, **LIGHT).learn(20, progress=False)
     assert not learner.exploring
     action, _ = learner.predict(np.zeros(1), deterministic=True)
     assert action[0] == pytest.approx(best, abs=0.05)
@@ -285,7 +287,7 @@ def test_the_best_action_is_found_if_the_reward_is_of_the_action_alone(
 
 @pytest.mark.parametrize("reward", [lambda a: -(a**2), lambda a: -1.0, lambda a: 0.0])
 def test_in_trials_of_one_step_there_is_no_goal_to_explore_for(reward: Any) -> None:
-    learner = kreps.KREPS(Tuning(reward, 1, False), seed=0).learn(2, progress=False)
+    learner = kreps.KREPS(Tuning(reward, 1, False), seed=0, **LIGHT).learn(2, progress=False)
     assert not learner.exploring
 
 

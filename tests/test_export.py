@@ -76,12 +76,11 @@ def random_policy(task: TaskSpec, n: int = 150, noise: float = 0.2) -> kreps.Pol
 @pytest.fixture(scope="module")
 def learnt() -> dict[int, kreps.Policy]:
     """Policies of the swing-up by seed, learnt with the presets single_step and model_based."""
-    return {
-        seed: kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=seed, preset=preset)
-        .learn(8, progress=False)
-        .policy
-        for seed, preset in ((100, "single_step"), (101, "model_based"))
-    }
+    env = gym.make("kreps/SwingUp-v0")
+    few = {"model_based.improvement_steps": 2, "model_based.acceptance_rollouts": 10}
+    single_step = kreps.KREPS(env, seed=100, preset="single_step").learn(8, progress=False)
+    model_based = kreps.KREPS(env, seed=101, **few).learn(3, progress=False)
+    return {100: single_step.policy, 101: model_based.policy}
 
 
 def session(path: Path) -> Any:

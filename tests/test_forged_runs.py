@@ -27,6 +27,7 @@ from kreps.learning.storage.lock import locked
 
 NAME = "kreps/SwingUp-v0"
 TINY = ["--no-report", "--set", "initial_rollouts=6", "--set", "rollouts_per_iteration=3"]
+TINY += ["--set", "restart_probability=0.1"]
 
 
 def call(*arguments: Any) -> None:

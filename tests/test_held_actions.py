@@ -27,7 +27,13 @@ from kreps.learning.timescale import action_repeat
 from kreps.policies.exploration import BangBang
 from kreps.presets import settings_of
 
-SMALL: dict[str, Any] = {"initial_rollouts": 5, "rollouts_per_iteration": 3, "growth": 0.0}
+SMALL: dict[str, Any] = {
+    "initial_rollouts": 5,
+    "rollouts_per_iteration": 3,
+    "growth": 0.0,
+    "model_based.improvement_steps": 1,
+    "model_based.acceptance_rollouts": 5,
+}
 
 
 class Counter(gym.Env[Any, Any]):

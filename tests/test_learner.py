@@ -31,6 +31,8 @@ TINY: dict[str, Any] = {
     "growth": 0.0,
     "window": 6,
     "window_steps": 0,
+    "model_based.improvement_steps": 1,
+    "model_based.acceptance_rollouts": 10,
 }
 NO_EXPLORER: dict[str, Any] = {"model_based.exploration_bonus": 0.0}
 STATES = np.stack([np.linspace(-1.5, 4.5, 7), np.linspace(-6.0, 6.0, 7)], axis=1)
@@ -38,6 +40,11 @@ STATES = np.stack([np.linspace(-1.5, 4.5, 7), np.linspace(-6.0, 6.0, 7)], axis=1
 
 def swing_up(seed: int = 0, **settings: Any) -> kreps.KREPS:
     return kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=seed, **{**TINY, **settings})
+
+
+def without_model() -> kreps.KREPS:
+    """A learner with fast updates, for what does not depend on them."""
+    return kreps.KREPS(gym.make("kreps/SwingUp-v0"), seed=0, initial_rollouts=6, model_based=None)
 
 
 @pytest.fixture(scope="module")
@@ -236,7 +243,7 @@ def test_a_callback_that_returns_false_stops_learning_after_all_were_called() ->
     def count(learner: kreps.KREPS, report: IterationReport) -> None:
         seen.append(report.iteration)
 
-    learner = swing_up()
+    learner = without_model()
     learner.learn(4, callback=[stop, count], progress=False)
     assert learner.state.iteration == 2
     assert seen == [1, 2]
@@ -244,19 +251,22 @@ def test_a_callback_that_returns_false_stops_learning_after_all_were_called() ->
 
 @pytest.mark.parametrize("false", [np.False_, np.array(False), np.mean([1.0]) > 2.0])
 def test_a_callback_may_return_the_false_of_numpy(false: Any) -> None:
-    learner = swing_up().learn(3, callback=lambda learner, report: false, progress=False)
+    learner = without_model()
+    learner.learn(3, callback=lambda learner, report: false, progress=False)
     assert learner.state.iteration == 1
 
 
 @pytest.mark.parametrize("other", [np.True_, None, 0, 0.0, np.float64(0.0), [], np.zeros(2)])
 def test_whatever_else_a_callback_returns_does_not_stop_learning(other: Any) -> None:
-    learner = swing_up().learn(2, callback=[lambda learner, report: other], progress=False)
+    learner = without_model()
+    learner.learn(2, callback=[lambda learner, report: other], progress=False)
     assert learner.state.iteration == 2
 
 
 @pytest.mark.parametrize("callback", [None, (), []])
 def test_there_may_be_no_callback(callback: Any) -> None:
-    assert swing_up().learn(1, callback=callback, progress=False).state.iteration == 1
+    learner = without_model().learn(1, callback=callback, progress=False)
+    assert learner.state.iteration == 1
 
 
 class Stop:
@@ -295,7 +305,7 @@ def test_an_exception_in_a_callback_keeps_the_update() -> None:
     def fail(learner: kreps.KREPS, report: IterationReport) -> None:
         raise RuntimeError("disk full")
 
-    learner = swing_up()
+    learner = without_model()
     with pytest.raises(RuntimeError, match="disk full"):
         learner.learn(1, callback=fail, progress=False)
     assert learner.state.iteration == 1
@@ -583,12 +593,18 @@ def test_evaluation_agrees_with_the_riccati_equation() -> None:
         assert average_reward(task, LinearFeedback(factor * gain)) < 1.05 * best
 
 
-@pytest.mark.parametrize("preset", ["model_based", "single_step"])
+FEW_STEPS = {"model_based.improvement_steps": 3, "model_based.acceptance_rollouts": 20}
+
+
+@pytest.mark.parametrize(
+    ("preset", "few", "iterations"), [("model_based", FEW_STEPS, 5), ("single_step", {}, 10)]
+)
 def test_the_learnt_policy_is_near_the_optimum_of_a_linear_quadratic_problem(
-    preset: str,
+    preset: str, few: dict[str, Any], iterations: int
 ) -> None:
     # Measured with seeds 0 to 7: with the preset "single_step" the cost is 1.02 to 1.07 of the
-    # optimum.  With "model_based" it is 1.01 to 1.05 for seven of them, 1.28 for one.
+    # optimum.  With "model_based" and few steps it is 1.02 to 1.06 for six of them, 1.15 and 1.20
+    # for two.
     # The cost of the first policy is 54 times the optimum, that of zero actions 4.6.
     _, best = optimum()
     shares = []
@@ -602,8 +618,9 @@ def test_the_learnt_policy_is_near_the_optimum_of_a_linear_quadratic_problem(
             initial_rollouts=40,
             rollouts_per_iteration=20,
             window=40,
+            **few,
         )
-        learner.learn(10, progress=False)
+        learner.learn(iterations, progress=False)
         assert learner.state.policy is not None
         shares.append(average_reward(learner.task, Greedy(learner.state.policy)) / best)
     first = (

@@ -71,6 +71,9 @@ STREAMED = LowRank(rank=80, above=0, subsample=200)
 IN_CHUNKS = Compute(chunk_size=60)
 
 
+LIGHT: dict[str, Any] = {"model_based.improvement_steps": 1, "model_based.acceptance_rollouts": 5}
+
+
 def swing_ups(seed: int, rollouts: int) -> list[Rollout]:
     env = gym.make("kreps/SwingUp-v0")
     policy = BangBang(TASK)
@@ -610,7 +613,7 @@ def test_a_data_set_of_the_same_rollouts_gives_the_same_policy(rollouts: list[Ro
 
 
 def test_an_unlimited_window_keeps_everything(rollouts: list[Rollout]) -> None:
-    learner = kreps.KREPS(TASK, window=None, low_rank=LOW, value=LOW_VALUE)
+    learner = kreps.KREPS(TASK, window=None, low_rank=LOW, value=LOW_VALUE, **LIGHT)
     for i in range(3):
         info = learner.update(rollouts[2 * i : 2 * i + 2])
         assert info.samples == sum(map(len, rollouts[: 2 * i + 2]))
@@ -619,7 +622,8 @@ def test_an_unlimited_window_keeps_everything(rollouts: list[Rollout]) -> None:
 
 
 def test_a_short_window_forgets_the_oldest(rollouts: list[Rollout]) -> None:
-    learner = kreps.KREPS(TASK, window=3, window_steps=0, low_rank=LOW, value=LOW_VALUE)
+    few = {"low_rank": LOW, "value": LOW_VALUE, **LIGHT}
+    learner = kreps.KREPS(TASK, window=3, window_steps=0, **few)
     learner.update(rollouts[:3])
     assert learner.update(rollouts[3:5]).samples == sum(map(len, rollouts[2:5]))
     assert (learner.state.rollouts, learner.state.steps) == (5, sum(map(len, rollouts[:5])))
@@ -688,6 +692,7 @@ TINY: dict[str, Any] = {
     "window": 6,
     "value": LOW_VALUE,
     "low_rank": LOW,
+    **LIGHT,
 }
 
 

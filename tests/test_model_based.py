@@ -483,7 +483,8 @@ def test_the_temperature_floor_is_lower_where_policies_are_tested(
 def test_a_resumed_learner_tests_its_policy_in_the_same_way(
     low_rank: LowRank | None, tmp_path: Any
 ) -> None:
-    learner = kreps.KREPS(TASK, low_rank=low_rank, kl_bound=0.1)
+    steps = {"model_based.improvement_steps": 2}
+    learner = kreps.KREPS(TASK, low_rank=low_rank, kl_bound=0.1, **steps)
     for seed in range(2):
         learner.update(turns(seed=seed))
     learner.save(tmp_path / "before")

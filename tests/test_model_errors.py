@@ -117,6 +117,7 @@ def rollouts(count: int, reward_noise: float, sensor_noise: float, seed: int = 0
 
 def errors(low_rank: bool = False, **noise: float) -> ModelErrors:
     more = {"low_rank.above": 0} if low_rank else {}
+    more["model_based.acceptance_rollouts"] = 0
     return KREPS(TASK, **more).update(rollouts(20, **noise)).held_out
 
 

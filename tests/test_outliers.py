@@ -15,7 +15,7 @@ from kreps.data.outliers import find_outliers
 from kreps.data.rollouts import Rollout, Rollouts
 
 TASK = kreps.TaskSpec(2, [-1.0], [1.0])
-SMALL: dict[str, Any] = {"model_based.acceptance_rollouts": 2}
+SMALL: dict[str, Any] = {"model_based": None}
 
 
 @pytest.fixture(autouse=True)
@@ -58,10 +58,10 @@ def told(update: Any) -> list[str]:
     return [str(each.message) for each in caught if each.category is kreps.DataWarning]
 
 
-LEARNERS = [kreps.KREPS, kreps.ValueIteration, kreps.NPALP]
+LEARNERS = [(kreps.KREPS, SMALL), (kreps.ValueIteration, {}), (kreps.NPALP, {})]
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize(("learner", "settings"), LEARNERS)
 @pytest.mark.parametrize(
     ("glitch", "says"),
     [
@@ -72,9 +72,9 @@ LEARNERS = [kreps.KREPS, kreps.ValueIteration, kreps.NPALP]
     ],
 )
 def test_one_glitch_is_told_with_its_place_and_the_remedy(
-    learner: Any, glitch: dict[str, float], says: str
+    learner: Any, settings: dict[str, Any], glitch: dict[str, float], says: str
 ) -> None:
-    made = learner(TASK, seed=0)
+    made = learner(TASK, seed=0, **settings)
     (message,) = told(lambda: made.update(spoilt(pushes(), 3, 17, **glitch)))
     assert message.startswith(says)
     for part in ("times as far from the median", "leave the rollout out", "kreps.DataWarning"):

@@ -27,7 +27,8 @@ from kreps.policies.base import StochasticPolicy
 from kreps.policies.exploration import RED, BangBang
 from kreps.seeding import Purpose, generator, integer_seed
 
-TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
+LIGHT: dict[str, Any] = {"model_based.improvement_steps": 1, "model_based.acceptance_rollouts": 5}
+TINY: dict[str, Any] = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6, **LIGHT}
 
 
 class PointMass(gym.Env[Any, Any]):
@@ -307,9 +308,8 @@ def test_noise_is_drawn_for_as_many_steps_as_the_time_limit_allows() -> None:
 def test_rollouts_that_only_the_environment_ends_need_no_memory_for_more(
     env: gym.Env[Any, Any], exploration: str
 ) -> None:
-    learner = kreps.KREPS(
-        env, seed=0, restart_probability=1e-9, exploration=exploration, initial_rollouts=6
-    )
+    few = {"exploration": exploration, "initial_rollouts": 6, **LIGHT}
+    learner = kreps.KREPS(env, seed=0, restart_probability=1e-9, **few)
     tracemalloc.start()
     learner.learn(1, progress=False)
     _, peak = tracemalloc.get_traced_memory()

@@ -18,7 +18,8 @@ from kreps.learning.timescale import choices, restart_probability
 from kreps.presets import settings_of
 from kreps.settings import Settings
 
-SMALL: dict[str, Any] = {"initial_rollouts": 4, "rollouts_per_iteration": 2}
+LIGHT: dict[str, Any] = {"model_based.improvement_steps": 1, "model_based.acceptance_rollouts": 5}
+SMALL: dict[str, Any] = {"initial_rollouts": 4, "rollouts_per_iteration": 2, **LIGHT}
 
 
 class Line(gym.Env[Any, Any]):
@@ -198,7 +199,7 @@ def test_rollouts_update_and_report_have_the_chosen_probability() -> None:
 
 def test_a_termination_is_remembered_when_its_rollout_is_forgotten() -> None:
     learner = kreps.KREPS(
-        kreps.TaskSpec(1, [-1.0], [1.0]), seed=0, window=2, window_steps=0, preset=Settings()
+        kreps.TaskSpec(1, [-1.0], [1.0]), seed=0, window=2, window_steps=0, **LIGHT
     )
     rng = np.random.default_rng(0)
 
@@ -291,7 +292,7 @@ def test_a_resumed_learner_makes_the_same_choice(limited: bool, tmp_path: Path) 
 
 def test_a_policy_file_has_the_times_of_the_task(tmp_path: Path) -> None:
     env = gym.wrappers.TimeLimit(Line(dt=0.05), 60)
-    learner = kreps.KREPS(env, seed=0, preset="single_step", **SMALL).learn(1, progress=False)
+    learner = kreps.KREPS(env, seed=0, preset="single_step").learn(1, progress=False)
     learner.policy.save(tmp_path / "policy.safetensors")
     task = kreps.load_policy(tmp_path / "policy.safetensors").process.task
     assert (task.dt, task.time_limit) == (0.05, 60)

@@ -174,7 +174,8 @@ def test_any_task_has_a_figure_with_readable_text(
 @pytest.fixture(scope="module")
 def learnt() -> kreps.KREPS:
     env = gym.make("kreps/SwingUp-v0")
-    return kreps.KREPS(env, initial_rollouts=10).learn(2, progress=False)
+    light = {"model_based.improvement_steps": 1, "model_based.acceptance_rollouts": 5}
+    return kreps.KREPS(env, initial_rollouts=10, **light).learn(2, progress=False)
 
 
 def test_the_model_predicts_what_the_greedy_policy_does(learnt: kreps.KREPS) -> None:

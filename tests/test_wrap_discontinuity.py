@@ -119,10 +119,8 @@ def test_the_value_function_jumps_with_the_reward_and_is_restored_from_a_checkpo
     env = gym.make("kreps/SwingUp-v0")
     jumps = {}
     for wrap in ("discontinuous", "continuous"):
-        batches = {"initial_rollouts": 30, "growth": 0.0}
-        learner = kreps.KREPS(
-            env, seed=1, low_rank=low_rank, **batches, **{"value.angle_wrap": wrap}
-        )
+        few = {"initial_rollouts": 30, "growth": 0.0, "model_based": None}
+        learner = kreps.KREPS(env, seed=1, low_rank=low_rank, **few, **{"value.angle_wrap": wrap})
         learner.learn(2, progress=False)
         either_side = np.array([[1.5 * np.pi - 0.01, 8.0], [-0.5 * np.pi + 0.01, 8.0]])
         low, high = learner.value_function(either_side)
