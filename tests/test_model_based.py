@@ -496,6 +496,8 @@ def test_a_resumed_learner_tests_its_policy_in_the_same_way(
     np.testing.assert_array_equal(
         *(each.policy.process.act(states, noise) for each in (learner, again))
     )
+    # of the update itself, also where the previous policy is kept
+    np.testing.assert_array_equal(learner.state.policy_start, again.state.policy_start)
 
 
 # ---- exact and low rank -----------------------------------------------------------------------
