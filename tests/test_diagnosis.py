@@ -57,7 +57,7 @@ CAUSES = {
     "exploration noise",
     "clipped actions",
 }
-OF_SAMPLES = {"idle columns", "action cost"}
+OF_SAMPLES = {"idle columns", "action cost", "delay or hidden state"}
 OF_EPISODES = {"episodes"}
 RISING = list(np.linspace(-90.0, -30.0, 12))
 LEVEL = [-90.0, -70.0, -50.0, -42.0, -40.0, -40.0, -40.5, -39.5, -40.0, -40.2, -39.8, -40.0]

@@ -17,6 +17,7 @@ from kreps.experiments.search import search_table
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "benchmarks")]
+import delays  # noqa: E402
 import peers_seconds  # noqa: E402
 import peers_table  # noqa: E402
 import robot_time  # noqa: E402
@@ -90,6 +91,9 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
             assert table == claims_table(content)
         elif name == "search":
             assert table == search_table(content)
+        elif name == "delays":
+            assert table == delays.table(content["results"]).strip()
+            assert "+" not in content["commit"]
         elif name == "peers-seconds":
             assert table == peers_seconds.table(content["rows"])
             assert "+" not in content["commit"]

@@ -81,7 +81,7 @@ def model_env(
     mean = LinearMean(np.array([2]), slopes, np.zeros(2))  # of the action alone
     rows = np.arange(len(data))[:, None]
     dynamics = Dynamics(
-        DeltaStateTargets(np.ones(2), mean),
+        DeltaStateTargets(np.ones(2), mean, TASK),
         lambda inputs: np.zeros((len(inputs), 2)),
         loo_residuals * (rows + 1.0) + np.zeros(2),
         None if termination is None else always(termination, len(data)),

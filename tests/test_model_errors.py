@@ -28,7 +28,7 @@ def data(*columns: list[float], terminated: bool = False) -> Transitions:
 def dynamics(residuals: list[list[float]], terminations: Terminations | None = None) -> Dynamics:
     """With these leave-one-out residuals (n, 3), in units of the state."""
     none = LinearMean(np.empty(0, np.intp), np.empty((0, 3)), np.zeros(3))
-    targets = DeltaStateTargets(np.ones(3), none)
+    targets = DeltaStateTargets(np.ones(3), none, TASK)
     return Dynamics(targets, lambda inputs: inputs, np.array(residuals), terminations)
 
 

@@ -18,6 +18,9 @@ MAX_WHOLE_NUMBER = 10**15
 MAX_ACTION_REPEAT = 10_000
 """Largest number of steps for which an action is held."""
 
+MAX_LAGS = 100
+"""Largest delay and history, in steps."""
+
 
 class Checked:
     """Checks of single fields, for frozen dataclasses.

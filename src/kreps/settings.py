@@ -7,7 +7,7 @@ from math import inf
 from numbers import Integral, Real
 from typing import ClassVar, Literal
 
-from kreps.checks import MAX_ACTION_REPEAT, MAX_COUNT, MAX_WHOLE_NUMBER, Checked
+from kreps.checks import MAX_ACTION_REPEAT, MAX_COUNT, MAX_LAGS, MAX_WHOLE_NUMBER, Checked
 from kreps.errors import ConfigurationError, shown
 
 TransitionModelName = Literal["dynamics", "change", "embedding", "sample"]
@@ -244,6 +244,8 @@ class Settings(OnPolicySettings):
         action_repeat: steps of the environment for which an action is held; those that are held
             together are one step for the learner, with the sum of their rewards.  None is chosen
             from the control period, by `kreps.learning.timescale.action_repeat`.
+        delay, history: number of earlier actions, and of earlier observations with actions, in a
+            state (docs/delays.md).  ``history="auto"`` chooses both by held-out error.
         kl_bound: epsilon of Eq. 2 in nats: largest relative entropy between the state-action
             distribution after an update and that of the samples.
         eta_floor: smallest temperature, in standard deviations of the reward.  Near convergence the
@@ -275,6 +277,8 @@ class Settings(OnPolicySettings):
     window_steps: int = 1_000
     rollout_lengths: RolloutLengths = "stratified"
     action_repeat: int | None = None
+    delay: int = 0
+    history: int | Literal["auto"] = 0
     kl_bound: float = 1.0
     eta_floor: float | None = None
     ridge: float | None = None
@@ -293,6 +297,9 @@ class Settings(OnPolicySettings):
         if self.action_repeat is not None:
             limit = f"a whole number from 1 to {MAX_ACTION_REPEAT}, or None to choose it"
             self._check("action_repeat", Integral, limit, lambda v: 1 <= v <= MAX_ACTION_REPEAT)
+        for name in ("delay", "history") if self.history != "auto" else ("delay",):
+            lags = f"a whole number from 0 to {MAX_LAGS}" + ', or "auto"' * (name == "history")
+            self._check(name, Integral, lags, lambda v: 0 <= v <= MAX_LAGS)
         if self.ridge is not None:
             self._check("ridge", Real, "positive and finite, or None", lambda v: 0 < v < inf)
         if self.eta_floor is not None:

@@ -117,9 +117,9 @@ class LowRankBatch:
         self.jitters: list[float] = []
         self.from_dataset = isinstance(samples, Dataset)
         if isinstance(samples, Dataset):
-            self.dataset = samples
+            self.dataset = samples.with_states(self.task)
         else:
-            self.dataset = Dataset.from_rollouts(window.rollouts, chunk_size=compute.chunk_size)
+            self.dataset = Dataset.from_rollouts(window.states, chunk_size=compute.chunk_size)
         self.size = len(self.dataset)
         read = list(compute.map(ChunkRewards(self.task), self.dataset.chunks))
         self.terminated = np.concatenate([chunk.terminated for chunk in read])

@@ -257,7 +257,8 @@ def world_model(
         model_env = ModelEnv(
             dynamics=step.model.dynamics,
             data=batch.data,
-            kernel=step.kernel,
+            # an unusual sequence of actions is no unexplored region
+            kernel=step.kernel.part(slice(0, batch.task.observed_factors)),
             task=batch.task,
             restart_probability=settings.p,
             exploring_starts=settings.exploring_starts,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from kreps.algorithms.dual import DualSolution
 from kreps.kernels.arrays import FloatArray
+from kreps.models.history_choice import HistoryChoice
 from kreps.models.model_errors import ModelErrors
 
 
@@ -40,6 +41,7 @@ class UpdateInfo:
             acts; None without a test.
         jitter: largest jitter of a factorisation of this update, except those at trial points of
             the hyper-parameter fits.
+        history_choice: delay and history of the states and why; None where they are given.
         seconds: CPU seconds of this process by stage.
     """
 
@@ -61,6 +63,7 @@ class UpdateInfo:
     noise: float
     rejected: bool | None
     jitter: float
+    history_choice: HistoryChoice | None
     seconds: dict[str, float]
 
     def numbers(self) -> dict[str, float]:

@@ -58,6 +58,18 @@ class LearnerState:
             raise DataError("there is no rollout to learn from; give at least one")
         return window
 
+    def with_history(self, delay: int, history: int) -> LearnerState:
+        """The state for an update with other states of the task.
+
+        If they differ from those before, nothing that was learnt with them is kept but the window:
+        policies, V and hyper-parameters are of states of another width.
+        """
+        task = self.window.task
+        if (delay, history) == (task.delay, task.history):
+            return self
+        window = replace(self.window, task=replace(task, delay=delay, history=history))
+        return LearnerState(window, self.iteration, self.rollouts, self.steps, self.terminated)
+
     def after(self, rollouts: int, steps: int, window: ReplayWindow, **learnt: Any) -> LearnerState:
         """The state after an update from so many new rollouts and steps, with what was learnt."""
         return replace(

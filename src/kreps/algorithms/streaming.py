@@ -54,7 +54,7 @@ class ChunkRewards:
         rollouts = chunk.load()
         data = rollouts.transitions
         found = data.points.shape[1], data.actions.shape[1]
-        wanted = self.task.observation_size, self.task.action_size
+        wanted = self.task.state_size, self.task.action_size
         if found != wanted:
             raise DataError(
                 f"{getattr(chunk, 'path', 'a chunk')} has {found[0]} observation and {found[1]} "
@@ -265,7 +265,7 @@ class PredictedSuccessors:
         predictions = self.delta_targets.linear_mean(inputs) + self.model.mean(inputs)
         # 2 (s + predicted change) - (s + observed change)
         rest = to_device(data.states - state_changes(data, self.task))
-        mirrored = 2.0 * self.delta_targets.changes(predictions) + rest
+        mirrored = 2.0 * self.delta_targets.state_changes(inputs, predictions) + rest
         averaged = 0.5 * (observed + self.state_features.basis.features(mirrored))
         if self.terminations is not None:
             successors = to_device(data.points[data.successor])

@@ -23,6 +23,7 @@ from kreps.data.compute import Compute
 from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout
 from kreps.errors import ConfigurationError
+from kreps.models.history_choice import HistoryChoice, choose_history
 from kreps.models.model_errors import model_errors
 from kreps.settings import Settings
 
@@ -40,7 +41,13 @@ def update(
         DataError: no rollouts at all, or some of another width than the task's.
         ConfigurationError: more samples than an exact update can serve, and no low rank.
     """
+    clock = Stopwatch()
+    choice = history_choice(state, samples, settings, rng)
+    clock.lap("history")
+    if choice is not None:
+        state = state.with_history(choice.chosen.delay, choice.chosen.history)
     batch = batch_of(state, samples, settings, rng, compute)
+    batch.clock.seconds |= {} if choice is None else clock.seconds
     step = reps_step(batch, state, temperature_floor(has_acceptance_test(batch), settings), rng)
     reward_start, rejected, explorer = state.reward_start, None, None
     if generates_samples(batch):
@@ -57,7 +64,26 @@ def update(
         reward_start=reward_start,
         policy_start=step.policy.x,
     )
-    return new_state, report(batch, step, rejected)
+    return new_state, report(batch, step, rejected, choice)
+
+
+def history_choice(
+    state: LearnerState,
+    samples: Sequence[Rollout] | Dataset,
+    settings: Settings,
+    rng: np.random.Generator,
+) -> HistoryChoice | None:
+    """Delay and history of the states of this update, where the settings leave them open.
+
+    They are chosen from all rollouts of the window, or from the first chunk of a data set.
+    """
+    if settings.history != "auto":
+        return None
+    if isinstance(samples, Dataset):
+        rollouts = samples.chunks[0].load()
+    else:
+        rollouts = state.append(samples).rollouts
+    return choose_history(rollouts, state.window.task, settings.delay, rng)
 
 
 def batch_of(
@@ -82,7 +108,9 @@ def batch_of(
     return LowRankBatch(window, samples, settings, low_rank, clock, compute, rng)
 
 
-def report(batch: Batch[Any, Any], step: Step, rejected: bool | None) -> UpdateInfo:
+def report(
+    batch: Batch[Any, Any], step: Step, rejected: bool | None, choice: HistoryChoice | None
+) -> UpdateInfo:
     """What is only reported of an update."""
     errors, actions, task = step.model.errors, batch.actions, batch.task
     beyond = (actions < task.action_low) | (actions > task.action_high)
@@ -106,5 +134,6 @@ def report(batch: Batch[Any, Any], step: Step, rejected: bool | None) -> UpdateI
         noise=step.policy.noise,
         rejected=rejected,
         jitter=max([step.dual.jitter, *batch.jitters]),
+        history_choice=choice,
         seconds=batch.clock.seconds,
     )

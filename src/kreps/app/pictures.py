@@ -52,7 +52,7 @@ def draw_run(folder: RunFolder, learner: KREPS) -> list[Path]:
         drawn = [plotting.save(curve, folder.path / "learning_curve.png")]
         labels = labels_of(learner.env, learner.task)
         drawn += _draw_trajectories(folder, learner, labels)
-        if learner.task.observation_size == 2:
+        if learner.task.state_size == 2:
             maps = policy_maps(learner.state, learner.task, labels)
             drawn.append(plotting.save(maps, folder.path / "policy_maps.png"))
     return drawn

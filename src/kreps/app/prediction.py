@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from kreps.data.history import first_lags, states_of
 from kreps.data.rollouts import Transitions
 from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray
@@ -29,7 +30,7 @@ def predicted_states(learner: KREPS, start: FloatArray, steps: int) -> FloatArra
 
     Args:
         learner: with at least one update.
-        start: (ds,) first state.
+        start: (do,) first observation.
         steps: of each rollout.
 
     Returns:
@@ -48,7 +49,8 @@ def predicted_states(learner: KREPS, start: FloatArray, steps: int) -> FloatArra
         )
         probability = learner.restart_probability
         model = ModelEnv(dynamics, data, kernel, learner.task, probability, 0.0, steps, 0.0)
-        starts = np.tile(start, (PREDICTIONS, 1))
+        first = states_of(start[None], first_lags(start[None], learner.task), learner.task)
+        starts = np.tile(first, (PREDICTIONS, 1))
         return model.trajectories(Greedy(learner.state.policy), starts, steps, rng)
 
 
@@ -56,4 +58,4 @@ def newest_transitions(window: ReplayWindow) -> Transitions:
     """The steps of the newest rollouts, at most `MAX_SAMPLES` but at least one rollout."""
     steps = np.cumsum(window.rollouts.lengths[::-1])
     count = max(1, int(np.searchsorted(steps, MAX_SAMPLES, side="right")))
-    return window.rollouts[len(steps) - count :].transitions
+    return window.states[len(steps) - count :].transitions

@@ -10,7 +10,9 @@ from typing import Protocol
 import numpy as np
 
 from kreps.data.compute import CHUNK_SIZE
+from kreps.data.history import stacked
 from kreps.data.rollouts import Rollout, Rollouts, Transitions
+from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, DataError
 from kreps.kernels.arrays import BoolArray, FloatArray, IntArray
 
@@ -43,6 +45,33 @@ class ArrayChunk:
 
     def load(self) -> Rollouts:
         return self.unread.read()
+
+
+@dataclass(frozen=True)
+class StackedChunk:
+    """A chunk whose points are states with earlier observations and actions.
+
+    Attributes:
+        chunk: with observations as points.
+        task: how many observations and actions a state has.
+    """
+
+    chunk: Chunk
+    task: TaskSpec
+
+    @property
+    def steps(self) -> int:
+        return self.chunk.steps
+
+    def load(self) -> Rollouts:
+        """The rollouts in memory.
+
+        Raises:
+            DataError: observations or actions of another width than the task's.
+        """
+        rollouts = self.chunk.load()
+        rollouts.check(self.task)
+        return stacked(rollouts, self.task)
 
 
 @dataclass(frozen=True)
@@ -99,6 +128,12 @@ class Dataset:
         flat = Rollouts.from_arrays(observations, actions, rewards, lengths, terminated, read=False)
         parts = chunk_slices(flat.offsets, chunk_size)
         return cls(tuple(ArrayChunk(flat[part]) for part in parts))
+
+    def with_states(self, task: TaskSpec) -> Dataset:
+        """The same samples with states of the task as points, where these are no observations."""
+        if task.state_size == task.observation_size:
+            return self
+        return Dataset(tuple(StackedChunk(chunk, task) for chunk in self.chunks))
 
     def __len__(self) -> int:
         """Number of samples n."""

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import operator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 
-from kreps.checks import MAX_ACTION_REPEAT, MAX_WHOLE_NUMBER
+from kreps.checks import MAX_ACTION_REPEAT, MAX_LAGS, MAX_WHOLE_NUMBER
 from kreps.data.spaces import Spaces
 from kreps.errors import ConfigurationError, DataError, NumericalError, shown
 from kreps.intake import as_array, is_sane
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.kernel import Factor, factors_of
+from kreps.kernels.kernel import Factor, Periodic, SquaredExponential, factors_of
 
 MAX_LENGTHSCALES = 3000
 """Largest number of lengthscales: a fit holds the distances of 200 samples for each, which are 0.9
@@ -32,6 +32,15 @@ def is_period(value: Any) -> bool:
     """Whether a value can be a control period in s."""
     number = isinstance(value, Real) and not isinstance(value, bool)
     return number and PERIODS[0] <= float(value) <= PERIODS[1]
+
+
+def _of_changes(factor: Any, first: int) -> Factor:
+    """The factor of the changes of some columns of the observation, the first one at ``first``."""
+    dims = tuple(first + i for i in factor.dims)
+    if isinstance(factor, Periodic):  # a change of an angle is no angle
+        return SquaredExponential(dims)
+    shifted: Factor = replace(factor, dims=dims)
+    return shifted
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +63,11 @@ class TaskSpec:
         action_repeat: steps of the environment for which an action is held.  What a learner calls a
             step is then so many of them, with the sum of their rewards.  ``dt`` and ``time_limit``
             are about single ones.
+        delay: steps by which an action takes effect later, or by which an observation arrives
+            later, or the sum of both.  The state of the learner then has the last ``delay``
+            applied actions beside the observation.
+        history: steps of which the state has observation and applied action, beside the newest
+            observation (`kreps.data.history`).  Both are in steps of the learner.
 
     Raises:
         ConfigurationError: sizes, limits or coordinates that are impossible or contradict each
@@ -70,6 +84,8 @@ class TaskSpec:
     dt: float | None = None
     time_limit: int | None = None
     action_repeat: int = 1
+    delay: int = 0
+    history: int = 0
 
     def __post_init__(self) -> None:
         try:
@@ -101,11 +117,11 @@ class TaskSpec:
             self._check_images(self.image_shape)
         if self.factor_count > MAX_LENGTHSCALES:
             raise ConfigurationError(
-                f"the {self.observation_size} coordinates of an observation have "
+                f"the {self.state_size} coordinates of a state have "
                 f"{self.factor_count} lengthscales, but at most {MAX_LENGTHSCALES} can be fitted; "
                 "give the pixels of an image one, by groups and image_shape of a TaskSpec, or by "
                 'the metadata "observation_groups" and "observation_image_shape" of an '
-                "environment; or observe fewer coordinates"
+                "environment; or observe fewer coordinates, or fewer earlier ones (history)"
             )
 
     def _check_sizes(self) -> None:
@@ -136,13 +152,15 @@ class TaskSpec:
         if self.time_limit is not None:
             self._check_steps("time_limit", MAX_WHOLE_NUMBER, ", or None if there is no limit")
         self._check_steps("action_repeat", MAX_ACTION_REPEAT)
+        self._check_steps("delay", MAX_LAGS, least=0)
+        self._check_steps("history", MAX_LAGS, least=0)
 
-    def _check_steps(self, name: str, most: int, otherwise: str = "") -> None:
+    def _check_steps(self, name: str, most: int, otherwise: str = "", least: int = 1) -> None:
         steps = getattr(self, name)
         whole = isinstance(steps, Integral) and not isinstance(steps, bool)
-        if not (whole and 1 <= steps <= most):
+        if not (whole and least <= steps <= most):
             raise ConfigurationError(
-                f"{name} = {shown(steps)}, but it must be a whole number of steps from 1 to "
+                f"{name} = {shown(steps)}, but it must be a whole number of steps from {least} to "
                 f"{most}{otherwise}"
             )
         object.__setattr__(self, name, int(steps))
@@ -188,14 +206,46 @@ class TaskSpec:
             )
 
     @property
-    def state_factors(self) -> tuple[Factor, ...]:
+    def action_lags(self) -> int:
+        """Number of earlier actions in a state."""
+        return max(self.delay, self.history)
+
+    @property
+    def observed_size(self) -> int:
+        """Number of coordinates of observation and earlier changes in a state, the first ones."""
+        return self.observation_size * (1 + self.history)
+
+    @property
+    def state_size(self) -> int:
+        """Number of coordinates ds of a state: observation, earlier changes, earlier actions."""
+        return self.observed_size + self.action_size * self.action_lags
+
+    @property
+    def observation_factors(self) -> tuple[Factor, ...]:
         """The factors of a kernel over observations, each with one lengthscale."""
         return factors_of(self.observation_size, self.periodic, self.groups, self.image_shape)
 
     @property
+    def state_factors(self) -> tuple[Factor, ...]:
+        """The factors of a kernel over states, each with one lengthscale."""
+        newest = self.observation_factors
+        if self.state_size == self.observation_size:
+            return newest
+        starts = range(self.observation_size, self.observed_size, self.observation_size)
+        earlier = (_of_changes(factor, start) for start in starts for factor in newest)
+        actions = (SquaredExponential((i,)) for i in range(self.observed_size, self.state_size))
+        return (*newest, *earlier, *actions)
+
+    @property
     def factor_count(self) -> int:
         """Number of `state_factors`, without making them: in a damaged file it may be huge."""
-        return self.observation_size - sum(len(group) - 1 for group in self.groups)
+        of_one = self.observation_size - sum(len(group) - 1 for group in self.groups)
+        return of_one * (1 + self.history) + self.action_size * self.action_lags
+
+    @property
+    def observed_factors(self) -> int:
+        """Number of `state_factors` that are not of earlier actions, the first ones."""
+        return self.factor_count - self.action_size * self.action_lags
 
     @property
     def action_size(self) -> int:

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
+from kreps.data.history import stacked
 from kreps.data.rewards import is_informative, is_long_enough, reward_depends_on_state
 from kreps.data.rollouts import NO_ROLLOUTS, Rollout, Rollouts, Transitions
 from kreps.data.task import TaskSpec
@@ -111,7 +112,12 @@ class ReplayWindow:
         """Number of steps of all rollouts."""
         return self.rollouts.steps
 
+    @cached_property
+    def states(self) -> Rollouts:
+        """The rollouts with states of the task as points, which may have earlier observations."""
+        return stacked(self.rollouts, self.task)
+
     @property
     def transitions(self) -> Transitions:
-        """The steps of all rollouts, in order."""
-        return self.rollouts.transitions
+        """The steps of all rollouts, in order, from state to state."""
+        return self.states.transitions

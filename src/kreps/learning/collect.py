@@ -14,6 +14,7 @@ from typing import Any, cast
 import gymnasium as gym
 import numpy as np
 
+from kreps.data.history import first_lags, next_lags, states_of
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.envs.batch import BatchModel, SettableModel, time_stamps_of
@@ -256,18 +257,19 @@ def _simulate_batch(
         states = np.array(model.initial(rngs))
         current = first = _checked(model.observe(states), len(live), task)
         start = time_stamps_of(model, states)
+        lags = first_lags(first, task)
         while len(live):
             drawn = [next(rows[j], None) for j in live.tolist()]
             going = np.array([row is not None for row in drawn])
-            live, states, current = live[going], states[going], current[going]
+            live, states, current, lags = live[going], states[going], current[going], lags[going]
             if not len(live):
                 break
             with default_errstate():
                 noise = np.stack([row for row in drawn if row is not None])
-                actions = policy.act(current, noise)
-            states, rewards, done = _step(
-                model, states, task.clip(actions), [rngs[j] for j in live.tolist()]
-            )
+                actions = policy.act(states_of(current, lags, task), noise)
+            applied = task.clip(actions)
+            states, rewards, done = _step(model, states, applied, [rngs[j] for j in live.tolist()])
+            lags = next_lags(current, lags, task.scaled(applied), task)
             current = _checked(model.observe(states), len(live), task)
             steps.append((live, actions, rewards, current))
             if start is not None:
@@ -276,7 +278,8 @@ def _simulate_batch(
             lengths[live] = t
             terminated[live[done]] = True
             _require_end(t, longest)
-            live, states, current = live[~done], states[~done], current[~done]
+            live, states = live[~done], states[~done]
+            current, lags = current[~done], lags[~done]
     except (ConfigurationError, DataError, NumericalError):
         raise
     except Exception as error:
@@ -313,10 +316,14 @@ def _simulate_one(
         observation, info = env.reset(seed=seed)
         times.append(time_in(info))
         observations.append(as_state(observation, task))
+        lags = first_lags(observations[-1][None], task)
         for row in noise:
+            newest = observations[-1][None]
             with default_errstate():  # the environment keeps the caller's
-                action = policy.act(observations[-1][None], row[None])[0]
-            observation, reward, ended, cut, info = env.step(spaces.actions(task.clip(action)))
+                action = policy.act(states_of(newest, lags, task), row[None])[0]
+            applied = task.clip(action)
+            lags = next_lags(newest, lags, task.scaled(applied[None]), task)
+            observation, reward, ended, cut, info = env.step(spaces.actions(applied))
             times.append(time_in(info))
             observations.append(as_state(observation, task))
             actions.append(action)

@@ -100,9 +100,7 @@ class Learner(Generic[MethodSettings]):
             if probability is not None and settings.get("restart_probability") is None:
                 settings["restart_probability"] = probability
         self.settings = self._settings(settings)
-        repeat = self._action_repeat(chooses=not isinstance(env, TaskSpec))
-        if repeat != self.task.action_repeat:
-            self.task = replace(self.task, action_repeat=repeat)
+        self.task = self._completed(self.task, chooses=not isinstance(env, TaskSpec))
         if not isinstance(env, TaskSpec):
             self._act_in(env)
         self.threads = None if threads is None else max(1, _whole_number("threads", threads))
@@ -111,9 +109,9 @@ class Learner(Generic[MethodSettings]):
         )
         self._policy: Policy | None = None
 
-    def _action_repeat(self, chooses: bool) -> int:
-        """Steps for which an action is held; ``chooses`` is False if the data are given."""
-        return self.task.action_repeat
+    def _completed(self, task: TaskSpec, chooses: bool) -> TaskSpec:
+        """The task with what the settings say of it; ``chooses`` is False if the data are given."""
+        return task
 
     def _act_in(self, env: Environment) -> None:
         """Collect in this environment from now on."""
@@ -278,7 +276,7 @@ class Learner(Generic[MethodSettings]):
             state, info = self._updated(samples, rng)
             state = replace(state, steps=self._environment_steps(state))
         storage.require_storable(state)
-        self.state = state
+        self.state, self.task = state, state.window.task
         return info
 
     def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -67,11 +68,17 @@ class KREPS(OnPolicyLearner[Settings]):
         self.compute = compute or Compute()
         super().__init__(env, seed=seed, periodic=periodic, threads=threads, **settings)
 
-    def _action_repeat(self, chooses: bool) -> int:
-        given = self.settings.action_repeat
-        if given is None and not chooses:
-            return self.task.action_repeat
-        return timescale.action_repeat(self.settings, self.task)
+    def _completed(self, task: TaskSpec, chooses: bool) -> TaskSpec:
+        settings, repeat = self.settings, task.action_repeat
+        if settings.action_repeat is not None or chooses:
+            repeat = timescale.action_repeat(settings, task)
+        history = 0 if settings.history == "auto" else settings.history
+        return replace(
+            task,
+            action_repeat=repeat,
+            delay=max(task.delay, settings.delay),
+            history=max(task.history, history),
+        )
 
     def _settings(self, changes: dict[str, Any]) -> Settings:
         return settings_of(self._preset, **changes)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from kreps.data.history import first_lags, next_lags, states_of
 from kreps.errors import ConfigurationError, DataError
 from kreps.intake import as_flags, as_numbers
 from kreps.kernels.arrays import FloatArray, IntArray, default_errstate
@@ -22,14 +23,17 @@ from kreps.seeding import Purpose, generator
 
 
 @dataclass(frozen=True)
-class HeldAction:
-    """What `Policy.predict` returns as state: the actions that are held, and for how much longer.
+class PolicyState:
+    """What `Policy.predict` returns as state, of m observations.
 
     Attributes:
-        commanded: (m, da) actions, before clipping.
+        lags: (m, ds - do) observations and actions before the next decision, the newest first
+            (`kreps.data.history`).
+        commanded: (m, da) actions that are held, before clipping.
         left: (m,) calls in which each is still to be returned.
     """
 
+    lags: FloatArray
     commanded: FloatArray
     left: IntArray
 
@@ -67,9 +71,10 @@ class Policy:
         Args:
             observation: one as the environment gives it, or several along a first axis; or one or
                 several that are flattened, (ds,) or (m, ds).
-            state: what the previous call returned; None decides anew.  With it, an action is
-                held for `action_repeat` steps.
-            episode_start: flag, or (m,) flags, of a new episode, in which nothing is held.
+            state: what the previous call returned; None begins an episode.  With it, an action is
+                held for `action_repeat` steps, and the policy knows the observations and actions
+                of the steps before, as one that was learnt with ``delay`` or ``history`` has to.
+            episode_start: flag, or (m,) flags, of a new episode, of which ``state`` is not used.
             deterministic: whether to leave out the exploration noise (the mean of a Gaussian
                 process).
 
@@ -77,7 +82,7 @@ class Policy:
             Action in the task's units, of the shape and the type of numbers that the environment
             takes ((da,) of float64 for a `TaskSpec`), or actions along a first axis; and the state
             for the next call, which is ``state`` unchanged where no action is held for longer than
-            a step.
+            a step and the policy needs no earlier steps.
 
         Raises:
             DataError: another shape, NaN or infinities, or a state of other calls.
@@ -86,11 +91,11 @@ class Policy:
         task = self.process.task
         remedy = "no action is defined for it, so check the sensors"
         observations = as_numbers("observations", observation, remedy)
-        states, single = task.given_spaces.states(observations)
-        if self.action_repeat == 1:
-            commanded = self._decided(states, deterministic)
+        observed, single = task.given_spaces.states(observations)
+        if self.action_repeat == 1 and task.state_size == task.observation_size:
+            commanded = self._decided(observed, deterministic)
         else:
-            state = self._held(states, state, episode_start, deterministic)
+            state = self._continued(observed, state, episode_start, deterministic)
             commanded = state.commanded
         applied = task.clip(commanded)
         return task.given_spaces.actions(applied[0] if single else applied), state
@@ -102,31 +107,41 @@ class Policy:
         noise = self._noise.standard_normal((len(states), self.process.task.action_size))
         return self.process.act(states, noise)
 
-    def _held(
-        self, states: FloatArray, state: Any, episode_start: Any, deterministic: bool
-    ) -> HeldAction:
-        """The actions of a call in states (m, ds): held ones, and new ones where none is left."""
-        count, width = len(states), self.process.task.action_size
+    def _continued(
+        self, observed: FloatArray, state: Any, episode_start: Any, deterministic: bool
+    ) -> PolicyState:
+        """The actions at observations (m, do): held ones, and new ones where none is left."""
+        task, count, first = (
+            self.process.task,
+            len(observed),
+            first_lags(observed, self.process.task),
+        )
         if state is None:
-            state = HeldAction(np.zeros((count, width)), np.zeros(count, np.intp))
-        if not isinstance(state, HeldAction) or state.commanded.shape != (count, width):
+            state = PolicyState(
+                first, np.zeros((count, task.action_size)), np.zeros(count, np.intp)
+            )
+        if not isinstance(state, PolicyState) or state.lags.shape != first.shape:
             raise DataError(
                 f"state = {state!r:.60}, but what predict returned for as many observations before "
                 "is needed; pass None at the start"
             )
         started = False if episode_start is None else as_flags("episode_start", episode_start)
         try:
-            new = np.broadcast_to(started, count) | (state.left == 0)
+            started = np.broadcast_to(started, count)
         except ValueError as error:
             raise DataError(
                 f"episode_start has shape {np.shape(episode_start)}, but a flag for each of "
                 f"{count} observations is needed"
             ) from error
+        new = started | (state.left == 0)
+        lags = np.where(started[:, None], first, state.lags)
         commanded, left = state.commanded.copy(), state.left.copy()
         if new.any():
-            commanded[new] = self._decided(states[new], deterministic)
+            known = observed[new], lags[new]
+            commanded[new] = self._decided(states_of(*known, task), deterministic)
             left[new] = self.action_repeat
-        return HeldAction(commanded, left - 1)
+            lags[new] = next_lags(*known, task.scaled_applied(commanded[new]), task)
+        return PolicyState(lags, commanded, left - 1)
 
     def save(self, path: str | Path) -> None:
         """Write the policy to a file; read it with `kreps.load_policy`."""

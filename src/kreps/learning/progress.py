@@ -27,6 +27,7 @@ from kreps.terminal import Output
 if TYPE_CHECKING:
     from kreps.learning.iteration import IterationReport
     from kreps.learning.learner import Learner
+    from kreps.models.history_choice import HistoryChoice
 
 GAP = "  "
 WIDTHS = {"iter": 4, "reward": 7, "ESS": 4, "CPU s": 5}
@@ -74,6 +75,7 @@ class ProgressTable:
         self._headings: list[str] = []
         self._rows_below = 0  # the headings
         self._stages: dict[str, float] = {}
+        self._history: tuple[int, int] | None = None
         self._bar = Progress(
             TextColumn("learning"),
             BarColumn(),
@@ -120,6 +122,7 @@ class ProgressTable:
         stages = seconds_by_stage(report)
         for name, seconds in stages.items():
             self._stages[name] = self._stages.get(name, 0.0) + seconds
+        self._say_history(getattr(report.update, "history_choice", None))
         shown = report.update.shown()
         note = shown.pop("note", "")
         if report.explorer_share > 0.0:
@@ -143,6 +146,15 @@ class ProgressTable:
         else:
             row["note"] = note
             self._print_line("  ".join(f"{name} {text}" for name, text in row.items() if text))
+
+    def _say_history(self, choice: HistoryChoice | None) -> None:
+        """Say which earlier steps the states have and why, at first and whenever that changes."""
+        if choice is None:
+            return
+        chosen = choice.chosen.delay, choice.chosen.history
+        if chosen != self._history:
+            self._history = chosen
+            self.say(str(choice))
 
     def _print_line(self, line: str) -> None:
         print(line, file=self._output, flush=True)

@@ -13,6 +13,9 @@ leave-one-out residual ``e_i`` of a sample is a draw of the noise at its state, 
 at the predicted successor ``s^``.  Both have the mean ``s^``, and on average over samples the
 variance of the noise; this is exact where V is quadratic within the range of the noise.  For the
 action that was taken, the two are the observed successor and its mirror image at ``s^``.
+
+Of a state with earlier changes and actions (`kreps.data.history`) only the newest observation is
+regressed.  The others follow from it, from the state and from the action.
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from functools import cached_property
 
 import numpy as np
 
+from kreps.data.history import state_changes_of
 from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import Array, FloatArray, IntArray, columns, like
@@ -88,33 +92,57 @@ class DeltaStateTargets:
     regression alone.
 
     Attributes:
-        scale: (ds,) root mean square changes; coordinates that share a lengthscale share one.
-        linear_mean: (n, ds) of states and scaled, applied actions (n, ds + da).
+        scale: (do,) root mean square changes of the observation; coordinates that share a
+            lengthscale share one.
+        linear_mean: (n, do) of states and scaled, applied actions (n, ds + da).
+        task: sizes of states and actions.
     """
 
     scale: FloatArray
     linear_mean: LinearMean
+    task: TaskSpec
 
     @classmethod
     def fit(cls, data: Transitions, task: TaskSpec) -> DeltaStateTargets:
         """Scale and linear mean of n transitions."""
         scale = np.ones(task.observation_size)
-        changes = state_changes(data, task)
+        changes = state_changes(data, task)[:, : task.observation_size]
         squares = np.mean(changes**2, axis=0)
-        for factor in task.state_factors:
+        for factor in task.observation_factors:
             dims = list(factor.dims)
             root_mean_square = np.sqrt(np.mean(squares[dims]))
             if root_mean_square > CONSTANT_RTOL * np.abs(data.points[:, dims]).max():
                 scale[dims] = root_mean_square
-        return cls(scale, linear_least_squares(state_actions(data, task), changes / scale, task))
+        mean = linear_least_squares(state_actions(data, task), changes / scale, task)
+        return cls(scale, mean, task)
 
     def targets(self, data: Transitions, task: TaskSpec) -> FloatArray:
-        """The targets (n, ds) of n transitions."""
-        return state_changes(data, task) / self.scale - self.linear_mean(state_actions(data, task))
+        """The targets (n, do) of n transitions."""
+        changes = state_changes(data, task)[:, : task.observation_size]
+        return changes / self.scale - self.linear_mean(state_actions(data, task))
 
     def changes(self, predictions: Array) -> Array:
-        """Changes of state (n, ds), from targets plus linear mean (n, ds)."""
+        """Changes of the observation (n, do), from targets plus linear mean (n, do)."""
         return predictions * like(self.scale, predictions)
+
+    def state_changes(self, inputs: Array, predictions: Array) -> Array:
+        """Changes of the whole state (n, ds).
+
+        Args:
+            inputs: (n, ds + da) states and scaled, applied actions.
+            predictions: (n, do) targets plus linear mean.
+        """
+        return state_changes_of(inputs, self.changes(predictions), self.task)
+
+    def residuals(self, errors: FloatArray) -> FloatArray:
+        """Errors of successors (n, ds), from those of targets (n, do).
+
+        Those of the observation are also those of its latest change; actions have none.
+        """
+        newest, task = self.changes(errors), self.task
+        repeated = [newest] * min(1 + task.history, 2)
+        known = np.zeros((len(errors), task.state_size - task.observation_size * len(repeated)))
+        return np.concatenate([*repeated, known], axis=1)
 
 
 def linear_least_squares(inputs: FloatArray, targets: FloatArray, task: TaskSpec) -> LinearMean:
@@ -135,7 +163,7 @@ def linear_least_squares(inputs: FloatArray, targets: FloatArray, task: TaskSpec
     if len(inputs) < SAMPLES_PER_COEFFICIENT * (1 + np.count_nonzero(used)):
         return LinearMean(np.empty(0, np.intp), np.empty((0, width)), np.zeros(width))
     ridge = np.full(inputs.shape[1], STATE_RIDGE * len(inputs))
-    scale[task.observation_size :], ridge[task.observation_size :] = 1.0, ACTION_RIDGE
+    scale[task.observed_size :], ridge[task.observed_size :] = 1.0, ACTION_RIDGE
     centre = inputs[:, used].mean(axis=0)
     z = (inputs[:, used] - centre) / scale[used]
     product = z.T @ (targets - targets.mean(axis=0))
@@ -164,8 +192,8 @@ class Dynamics:
 
     Attributes:
         delta_targets: scale and linear mean of the targets.
-        regression: predicts targets (m, ds) from states and scaled, applied actions (m, ds + da).
-        loo_residuals: (n, ds) leave-one-out errors of the targets.
+        regression: predicts targets (m, do) from states and scaled, applied actions (m, ds + da).
+        loo_residuals: (n, do) leave-one-out errors of the targets.
         terminations: the termination model; None if no episode terminated.
     """
 
@@ -177,7 +205,7 @@ class Dynamics:
     @cached_property
     def residuals(self) -> FloatArray:
         """Leave-one-out errors (n, ds) of the changes of state, in units of the state."""
-        return self.delta_targets.changes(self.loo_residuals)
+        return self.delta_targets.residuals(self.loo_residuals)
 
     def predict(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Mean successors (m, ds) and probabilities of a termination there (m,).
@@ -211,7 +239,8 @@ class Dynamics:
 
     def _mean_successors(self, inputs: FloatArray) -> FloatArray:
         predictions = self.delta_targets.linear_mean(inputs) + self.regression(inputs)
-        return inputs[:, : self.residuals.shape[1]] + self.delta_targets.changes(predictions)
+        states = inputs[:, : self.delta_targets.task.state_size]
+        return states + self.delta_targets.state_changes(inputs, predictions)
 
     def expected_features(
         self, basis: Basis, restart: FloatArray, rows: IntArray, inputs: FloatArray

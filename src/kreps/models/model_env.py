@@ -37,7 +37,7 @@ def supports_model_rollouts(data: Transitions, task: TaskSpec) -> bool:
     Not in images, where errors of single pixels add up to what no image of the task looks like; nor
     with fewer samples than the linear mean of the dynamics needs.
     """
-    coefficients = 1 + task.observation_size + task.action_size
+    coefficients = 1 + task.state_size + task.action_size
     return task.image_shape is None and len(data) >= SAMPLES_PER_COEFFICIENT * coefficients
 
 

@@ -86,7 +86,7 @@ def dynamics_errors(
     """
     changes, size = state_changes(data, task), np.abs(data.points).max(axis=0)
     coordinates, errors = [], []
-    for factor in task.state_factors:
+    for factor in task.observation_factors:
         dims = list(factor.dims)
         change = np.sqrt(np.mean(changes[:, dims] ** 2))
         if change > CONSTANT_RTOL * size[dims].max():

@@ -37,6 +37,9 @@ REGULARISER_RANGE = (1e-6, 1.0)
 """Limits of lambda: the smallest one keeps the Gram matrix of repeated samples well-conditioned,
 the largest one predicts half of a target at its own isolated sample."""
 
+MIN_STEP = 0.05
+"""Smallest change in a step, in lengthscales, by which those of earlier actions are multiplied."""
+
 LOG_LENGTHSCALE_RANGE = 3.0
 """Largest distance of a log lengthscale from that of the median distance."""
 
@@ -47,9 +50,32 @@ magnitude between tasks."""
 
 
 def state_kernel(data: Transitions, task: TaskSpec, rng: np.random.Generator) -> Kernel:
-    """The kernel over states at median lengthscales."""
+    """The kernel over states at median lengthscales.
+
+    An earlier action changes the state by what one step does, which is a part of the range of
+    states.  The lengthscales of earlier actions are larger than their median by the inverse of this
+    part, so that states are as different as their consequences.
+    """
     factors = task.state_factors
-    return Kernel(factors, median_lengthscales(factors, data.points, rng))
+    kernel = Kernel(factors, median_lengthscales(factors, data.points, rng))
+    if not task.action_lags:
+        return kernel
+    observed, scale = task.observed_factors, np.ones(len(factors))
+    scale[observed:] = 1.0 / _step_size(data, kernel.part(slice(0, observed)))
+    return kernel.with_lengthscales(scale * kernel.lengthscales)
+
+
+def _step_size(data: Transitions, kernel: Kernel) -> float:
+    """Root mean square change in a step, in lengthscales, of the factor that changes most.
+
+    It is one at most.
+    """
+    states, successors = data.states, data.points[data.successor]
+    moved = [
+        np.mean(np.sum((part.embed(successors) - part.embed(states)) ** 2, axis=1))
+        for part in (kernel.part(slice(i, i + 1)) for i in range(len(kernel.factors)))
+    ]
+    return min(max(float(np.sqrt(max(moved))), MIN_STEP), 1.0)
 
 
 def with_wrap_discontinuity(
@@ -171,7 +197,7 @@ class HyperparameterFit:
     ) -> HyperparameterFit:
         """The problem for n samples; arguments as of `embedding_hyperparameters`."""
         action_factors = tuple(
-            SquaredExponential((task.observation_size + i,)) for i in range(task.action_size)
+            SquaredExponential((task.state_size + i,)) for i in range(task.action_size)
         )
         factors = (*state_kernel.factors, *action_factors)
         squares = np.sum((targets - targets.mean(axis=0)) ** 2, axis=1)

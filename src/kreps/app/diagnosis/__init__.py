@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, get_args
 
 from kreps.app.diagnosis.columns import Row
+from kreps.app.diagnosis.delay import delay_or_hidden_state
 from kreps.app.diagnosis.episodes import episodes, rollout_length
 from kreps.app.diagnosis.exploration import clipped_actions, exploration_noise
 from kreps.app.diagnosis.finding import Finding, Severity
@@ -64,6 +65,7 @@ def diagnose(
         dynamics(rows),
         terminations(rows),
         reward_model(rows, near_best(rows, evaluation, references)),
+        delay_or_hidden_state(window),
         idle_columns(window),
         basis_of_value(rows),
         exploration_noise(rows, evaluation),

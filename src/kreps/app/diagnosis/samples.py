@@ -109,7 +109,7 @@ def idle_columns(window: ReplayWindow | None) -> Finding | None:
     width = window.task.observation_size
     if width > MAX_COLUMNS:
         return None
-    found = IdleColumns.from_samples(window.transitions, window.task)
+    found = IdleColumns.from_samples(window.rollouts.transitions, window.task)
     said = [
         *([f"{_named(found.constant)} never changes"] if len(found.constant) == 1 else []),
         *([f"{_named(found.constant)} never change"] if len(found.constant) > 1 else []),
@@ -143,7 +143,7 @@ def action_cost(window: ReplayWindow | None) -> Finding | None:
     name = "action cost"
     if window is None or not window.rollouts or window.task.observation_size > MAX_COLUMNS:
         return None
-    share = action_cost_share(window.transitions, window.task)
+    share = action_cost_share(window.rollouts.transitions, window.task)
     if not np.isfinite(share):
         return None
     measured = f"A quadratic cost of the actions makes {share:.0%} of the variance of the reward"

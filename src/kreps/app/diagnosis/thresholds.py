@@ -71,6 +71,13 @@ SAMPLES_PER_TERM = 20
 MAX_COLUMNS = 200
 """Largest number of observation columns that are looked at one by one."""
 
+HELD_OUT_NOTE = 0.71
+"""Held-out error of predictions with earlier observations and actions, as a share of the one
+without, below which they are needed: half of the squared error."""
+
+MIN_HELD_OUT_STEPS = 200
+"""Smallest number of steps from which a delay or a hidden state is looked for."""
+
 ACTION_COST_NOTE = 0.5
 """Share of the variance of the reward that is a cost of actions, from which on it dominates."""
 

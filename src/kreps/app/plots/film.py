@@ -71,7 +71,7 @@ def film(
         StorageError: the file cannot be written.
     """
     check_film_name(path)
-    plane = task.observation_size == 2
+    plane = task.state_size == 2
     width = COLUMN * (2.0 if plane else 1.0)
     with rc_context({**STYLE, "figure.constrained_layout.use": False}):
         figure = Figure(figsize=(width, HEIGHT), dpi=DPI)

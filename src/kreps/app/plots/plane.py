@@ -58,9 +58,9 @@ def state_grid(state: LearnerState, task: TaskSpec) -> tuple[FloatArray, FloatAr
     Raises:
         ConfigurationError: the states are not two-dimensional.
     """
-    if task.observation_size != 2:
+    if task.state_size != 2:
         raise ConfigurationError(
-            f"maps need a two-dimensional state space, this one has {task.observation_size}"
+            f"maps need a two-dimensional state space, this one has {task.state_size}"
         )
     points = state.window.transitions.points
     axes = []

@@ -191,7 +191,7 @@ class RobotSession:
         task = self._learner.task
         # what the policy computes once is computed now, so that the first action is not late
         with default_errstate():
-            policy.act(np.zeros((1, task.observation_size)), np.zeros((1, task.action_size)))
+            policy.act(np.zeros((1, task.state_size)), np.zeros((1, task.action_size)))
         with self._lock:
             self._rollout = RolloutInProgress(task, policy, planned)
             self._pace = Pace(self.period)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from kreps.data.history import first_lags, next_lags, states_of
 from kreps.data.rollouts import Rollout
 from kreps.data.task import TaskSpec
 from kreps.errors import ConfigurationError, DataError, shown
@@ -100,6 +101,9 @@ class RolloutInProgress:
 
     def _decide(self, state: FloatArray, at_limit: bool) -> None:
         """Complete the step before with its successor, and choose a new action or end."""
+        newest = state[None]
+        if not self._points:
+            self._lags = first_lags(newest, self.task)
         self._points.append(state)
         if self._actions:
             self._rewards.append(self._sum)
@@ -112,7 +116,10 @@ class RolloutInProgress:
             self.end = End.LENGTH
         else:
             with default_errstate():
-                self._actions.append(self.policy.act(state[None], noise[None])[0])
+                states = states_of(newest, self._lags, self.task)
+                self._actions.append(self.policy.act(states, noise[None])[0])
+            applied = self.task.scaled_applied(self._actions[-1][None])
+            self._lags = next_lags(newest, self._lags, applied, self.task)
             self._left = self.task.action_repeat
 
     def reward(self, reward: Any, terminated: Any) -> None:

@@ -23,12 +23,13 @@ from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Factor, Periodic, SmoothedImage, SquaredExponential, smoothing
 from kreps.learning.storage.atomic import write_atomically
 from kreps.learning.storage.checksum import BLANK, NAME, sealed
+from kreps.learning.storage.onnx_graph import Graph, Number
+from kreps.learning.storage.onnx_lags import add_next_lags, add_state, has_lags, lags_size
 from kreps.policies.sparse_gp import SparseGP
 
 OPSET, IR_VERSION = 17, 8
 """Versions of 2022, so that older runtimes on robots can read a model."""
 
-Number = type[np.floating[Any]]
 DTYPES: dict[str, Number] = {"float64": np.float64, "float32": np.float32}
 
 GUARD = "observation_or_action_is_not_finite"
@@ -46,9 +47,13 @@ def write_onnx(
 ) -> str:
     """Write a model of a policy with opset 17 of ONNX; the same policy gives the same bytes.
 
-    Input ``observation`` (batch, ds).  Outputs ``action`` (batch, da), the mean clipped to the
+    Input ``observation`` (batch, do).  Outputs ``action`` (batch, da), the mean clipped to the
     task's limits, and ``standard_deviation`` (batch, da) of the commanded action, both in the
     task's units.  A batch needs memory for batch x centres x coordinates numbers.
+
+    A policy of states with earlier steps (`kreps.data.history`) also has the input ``lags``
+    (batch, h do + k da) and the output ``next_lags``, which is the input of the next decision.  At
+    the start of an episode they are h times the observation, then zeros.
 
     A model never hands out a number that is not finite: if one is among observations or results,
     its evaluation ends with an error that has `GUARD` in its text.
@@ -80,7 +85,7 @@ def write_onnx(
         ) from error
     single = single_precision_error(policy) <= tolerance
     arithmetic = dtype if single else "float64"
-    with np.errstate(over="ignore"):  # `_Graph.constant` raises an error with the name
+    with np.errstate(over="ignore"):  # `Graph.constant` raises an error with the name
         graph = _graph_of(policy, onnx.helper, DTYPES[dtype], DTYPES[arithmetic])
     model = onnx.helper.make_model(
         graph,
@@ -124,62 +129,22 @@ def _note(policy: SparseGP, arithmetic: str) -> str:
         "action_repeat": task.action_repeat,
         "dt": task.dt,
         "image_shape": None if task.image_shape is None else list(task.image_shape),
+        **({"lags": [task.history, task.action_lags]} if has_lags(task) else {}),
     }
     return json.dumps(content, sort_keys=True)
 
 
-class _Graph:
-    """Nodes and constants, in the order in which they are added.
-
-    Attributes:
-        dtype: of the arithmetic.
-    """
-
-    def __init__(self, helper: Any, dtype: Number) -> None:
-        self.helper, self.dtype = helper, dtype
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
-
-    def constant(self, name: str, values: Any, dtype: Number | None = None) -> str:
-        """Add a tensor, of the dtype of the arithmetic unless another one is given."""
-        dtype = dtype or self.dtype
-        array = np.asarray(values, dtype=np.float64).astype(dtype)
-        if not np.isfinite(array).all():
-            raise ConfigurationError(
-                f"{name} of the policy go up to {np.abs(values).max():.3g}, the limit of "
-                f"{np.dtype(dtype).name} is {np.finfo(dtype).max:.3g}; "
-                "export it in float64, or learn in other units"
-            )
-        return self._tensor(name, array)
-
-    def integers(self, name: str, values: Sequence[int]) -> str:
-        return self._tensor(name, np.array(values, dtype=np.int64))
-
-    def _tensor(self, name: str, array: NDArray[Any]) -> str:
-        data = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<")).tobytes()
-        kind = self.kind(array.dtype)
-        self.constants.append(self.helper.make_tensor(name, kind, array.shape, data, raw=True))
-        return name
-
-    def kind(self, dtype: Any) -> int:
-        """The number of a dtype in ONNX."""
-        return int(self.helper.np_dtype_to_tensor_dtype(np.dtype(dtype)))
-
-    def node(self, operation: str, *inputs: str, out: str = "", **attributes: Any) -> str:
-        """Add a node; the name of its output, ``out`` or a new one, is returned."""
-        name = out or f"{operation.lower()}_{len(self.nodes)}"
-        self.nodes.append(self.helper.make_node(operation, inputs, [name], name=name, **attributes))
-        return name
-
-    def cast(self, values: str, dtype: Any) -> str:
-        return self.node("Cast", values, to=self.kind(dtype))
-
-
 def _graph_of(policy: SparseGP, helper: Any, border: Number, arithmetic: Number) -> Any:
     """The graph with inputs and outputs of dtype ``border``, computed in ``arithmetic``."""
-    graph, task = _Graph(helper, arithmetic), policy.task
-    commanded, deviation = _mean_and_deviation(graph, policy, border)
-    zero = _zero_if_finite(graph, ("observation", commanded, deviation), border)
+    graph, task = Graph(helper, arithmetic), policy.task
+    widths = {"observation": task.observation_size}
+    state = "observation"
+    if has_lags(task):
+        widths["lags"] = lags_size(task)
+        state = add_state(graph, task)
+    inputs = tuple(widths)
+    commanded, deviation = _mean_and_deviation(graph, policy, state, border)
+    zero = _zero_if_finite(graph, (*inputs, commanded, deviation), border)
     low, high = (
         graph.constant(name, _inwards(limit, task.action_centre, border), border)
         for name, limit in (("action_low", task.action_low), ("action_high", task.action_high))
@@ -189,25 +154,26 @@ def _graph_of(policy: SparseGP, helper: Any, border: Number, arithmetic: Number)
         action = graph.node("Round", action)
     graph.node("Add", action, zero, out="action")
     graph.node("Add", deviation, zero, out="standard_deviation")
-
-    widths = {
-        "observation": task.observation_size,
-        "action": task.action_size,
-        "standard_deviation": task.action_size,
-    }
+    widths |= {"action": task.action_size, "standard_deviation": task.action_size}
+    if has_lags(task):
+        widths["next_lags"] = lags_size(task)
+        add_next_lags(graph, task, border)
     borders = [
         helper.make_tensor_value_info(name, graph.kind(border), ["batch", width])
         for name, width in widths.items()
     ]
+    given, returned = borders[: len(inputs)], borders[len(inputs) :]
     return helper.make_graph(
-        graph.nodes, "kreps_policy", borders[:1], borders[1:], initializer=graph.constants
+        graph.nodes, "kreps_policy", given, returned, initializer=graph.constants
     )
 
 
-def _mean_and_deviation(graph: _Graph, policy: SparseGP, border: Number) -> tuple[str, str]:
+def _mean_and_deviation(
+    graph: Graph, policy: SparseGP, state: str, border: Number
+) -> tuple[str, str]:
     """Mean and standard deviation of the commanded action, (batch, da) each."""
     task = policy.task
-    k = _kernel_values(graph, policy, graph.cast("observation", graph.dtype))
+    k = _kernel_values(graph, policy, graph.cast(state, graph.dtype))
 
     weights = graph.constant("mean_weights", policy.mean_weights * task.action_scale)
     centre = graph.constant("action_centre", task.action_centre)
@@ -223,7 +189,7 @@ def _mean_and_deviation(graph: _Graph, policy: SparseGP, border: Number) -> tupl
     return mean, graph.cast(deviation, border)
 
 
-def _zero_if_finite(graph: _Graph, values: Sequence[str], border: Number) -> str:
+def _zero_if_finite(graph: Graph, values: Sequence[str], border: Number) -> str:
     """A zero, which cannot be computed if any of the values is NaN or infinite.
 
     An operation of ONNX cannot be made to fail, except by an index that is out of bounds: the zero
@@ -238,8 +204,8 @@ def _zero_if_finite(graph: _Graph, values: Sequence[str], border: Number) -> str
     return graph.node("Gather", zeros, index, out=GUARD, axis=0)
 
 
-def _kernel_values(graph: _Graph, policy: SparseGP, observation: str) -> str:
-    """``k(observation, centres)``, (batch, r)."""
+def _kernel_values(graph: Graph, policy: SparseGP, state: str) -> str:
+    """``k(state, centres)``, (batch, r)."""
     kernel, states = policy.kernel, policy.states
     parts = [factor.coordinates(states) for factor in kernel.factors]
     raw = np.concatenate(parts, axis=1)
@@ -248,8 +214,7 @@ def _kernel_values(graph: _Graph, policy: SparseGP, observation: str) -> str:
     origin = raw.mean(axis=0).astype(graph.dtype)
     per_length = 1.0 / np.repeat(kernel.lengthscales, [part.shape[1] for part in parts])
     found = [
-        _coordinates(graph, factor, observation, f"factor_{i}")
-        for i, factor in enumerate(kernel.factors)
+        _coordinates(graph, factor, state, f"factor_{i}") for i, factor in enumerate(kernel.factors)
     ]
     coordinates = graph.node("Concat", *found, axis=1)
     coordinates = graph.node("Sub", coordinates, graph.constant("origin", origin))
@@ -263,11 +228,11 @@ def _kernel_values(graph: _Graph, policy: SparseGP, observation: str) -> str:
     return graph.node("Exp", graph.node("Mul", squared, graph.constant("minus_half", -0.5)))
 
 
-def _coordinates(graph: _Graph, factor: Factor, observation: str, name: str) -> str:
-    """``factor.coordinates(observation)``, (batch, m); ``name`` is that of its constants."""
+def _coordinates(graph: Graph, factor: Factor, state: str, name: str) -> str:
+    """``factor.coordinates(state)``, (batch, m); ``name`` is that of its constants."""
     assert isinstance(factor, SquaredExponential | Periodic | SmoothedImage)
     dims = graph.integers(f"{name}_dims", factor.dims)
-    columns = graph.node("Gather", observation, dims, axis=1)
+    columns = graph.node("Gather", state, dims, axis=1)
     if isinstance(factor, SquaredExponential):
         return columns
     if isinstance(factor, Periodic):

@@ -59,8 +59,17 @@ TASK = Record(
         "dt": Plain(),
         "time_limit": Plain(),
         "action_repeat": Plain(),
+        "delay": Plain(),
+        "history": Plain(),
     },
-    absent={"spaces": None, "dt": None, "time_limit": None, "action_repeat": 1},
+    absent={
+        "spaces": None,
+        "dt": None,
+        "time_limit": None,
+        "action_repeat": 1,
+        "delay": 0,
+        "history": 0,
+    },
 )
 
 LENGTHSCALES = Limit("between 1e-100 and 1e100", lambda v: (v > 1e-100) & (v < 1e100))
@@ -188,7 +197,12 @@ def decode_task(header: Mapping[str, Any]) -> TaskSpec:
 
 def task_sizes(task: TaskSpec) -> dict[str, int]:
     """The sizes that the task decides."""
-    return {"g": task.factor_count, "ds": task.observation_size, "da": task.action_size}
+    return {
+        "g": task.factor_count,
+        "do": task.observation_size,
+        "ds": task.state_size,
+        "da": task.action_size,
+    }
 
 
 def save_policy(policy: LearntPolicy, path: str | Path, max_bytes: int = MAX_FILE_BYTES) -> None:

@@ -53,7 +53,7 @@ ROLLOUTS = Converted(
             "rewards": Array(("n",), DATA),
             "terminated": Array(("R",), dtype="BOOL"),
             "offsets": Array(("R+1",), dtype="I64"),
-            "points": Array(("n+R", "ds"), DATA),
+            "points": Array(("n+R", "do"), DATA),
             "actions": Array(("n", "da"), DATA),
             "times": Optional(Array(("n+R",), DATA)),
         },
@@ -62,7 +62,7 @@ ROLLOUTS = Converted(
     lambda rollouts: rollouts,
     _checked,
 )
-"""R rollouts of n steps in all."""
+"""R rollouts of n steps in all, of do coordinates of an observation."""
 
 
 def save_rollouts(
