@@ -61,6 +61,7 @@ PANELS: dict[str, tuple[str, ...]] = {
         "dynamics",
         "terminations",
         "reward model",
+        "delay or hidden state",
         "idle columns",
     ),
     "Basis of V: number of features": ("basis of V",),
