@@ -83,9 +83,10 @@ class ModelOfReturns(ModelEnv):
         draws = rng.standard_normal(count)
         zeros = np.zeros((1, count))
         return ModelRollouts(
-            zeros + policy.mean * (1.0 + policy.risk * draws) + 100.0 * draws,
-            zeros + policy.similarity,
-            zeros > 0.0,
+            rewards=zeros + policy.mean * (1.0 + policy.risk * draws) + 100.0 * draws,
+            actions=zeros[:, :, None],
+            similarity=zeros + policy.similarity,
+            ended=zeros > 0.0,
         )
 
 
@@ -132,7 +133,7 @@ def world_of(model_env: ModelEnv, rewards: FloatArray, reward_model: Any) -> Wor
 def comparison_of(rollouts: int = 100, seed: int = 0, **changes: Any) -> ModelComparison | None:
     env = learnt_env()
     env = ModelOfReturns(**{field.name: getattr(env, field.name) for field in fields(env)})
-    world = world_of(env, np.array([-1000.0, 0.0]), lambda inputs: inputs[:, :1])
+    world = world_of(env, np.array([-1000.0, 0.0]), lambda inputs: inputs[:, :1] - 500.0)
     return compare_in_model(replace(world, **changes), rollouts, seed)
 
 
@@ -172,7 +173,7 @@ def test_a_policy_that_leaves_the_explored_region_is_rejected() -> None:
     assert acceptance(Policy(2.0, similarity=0.5), Policy(1.0)) is True
     # also if the previous policy has left it as far
     assert acceptance(Policy(2.0, similarity=0.4), Policy(1.0, similarity=0.5)) is True
-    # where neither is near any sample, both have the smallest reward
+    # where neither is near any sample, both have the reward of the worst state
     assert acceptance(Policy(2.0, similarity=0.0), Policy(1.0, similarity=0.0)) is False
 
 
@@ -184,7 +185,7 @@ def test_similarities_are_relative_to_the_typical_one_of_the_samples() -> None:
     at_samples = comparison.returns(Policy(2.0))
     as_typical = comparison.returns(Policy(2.0, similarity=typical))
     np.testing.assert_array_equal(as_typical, at_samples)
-    # half as similar: half of the way from the smallest reward, which is -1000
+    # half as similar: half of the way from the reward of the worst state, which is -1000
     halfway = comparison.returns(Policy(2.0, similarity=0.5 * typical))
     np.testing.assert_allclose(halfway, 0.5 * (at_samples - 1000.0))
 
@@ -279,3 +280,22 @@ def test_all_policies_of_a_comparison_have_the_same_random_numbers() -> None:
     gain = little_more - returns
     assert gain.mean() > 0.0 and gain.std() < 0.2 * returns.std()
     assert not np.allclose(other.returns(Push(0.1, 0.5)), returns)
+
+
+def test_the_cost_of_an_action_not_taken_does_not_make_new_states_look_worse() -> None:
+    """Samples have costly actions; the policy goes far from them with a free one."""
+
+    def reward(inputs: FloatArray) -> FloatArray:  # of the speed, less a cost of the push
+        return (0.1 * inputs[:, 1] - 5.0 * inputs[:, 2] ** 2)[:, None]
+
+    env = learnt_env()
+    world = replace(world_of(env, np.array([-9.0, 1.0]), reward), states=env.data.states)
+    comparison = ModelComparison(world, 2, seed=0)
+    slowest = float(env.data.states[:, 1].min())
+    model = world.reward_model
+    wanted = model.mean + 0.1 * slowest  # without any cost
+    found = comparison._in_worst_state(np.zeros((3, 2, 1)))
+    np.testing.assert_allclose(found, np.full((3, 2), wanted), rtol=1e-12)
+    # a costly action is as costly there as anywhere
+    costly = comparison._in_worst_state(np.ones((3, 2, 1)))
+    np.testing.assert_allclose(costly, np.maximum(found - 5.0, model.smallest), rtol=1e-12)

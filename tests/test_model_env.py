@@ -242,7 +242,7 @@ def average_rewards(
     typical: float = 1.0,
 ) -> FloatArray:
     rollouts = env.evaluate(policy, reward, count, np.random.default_rng(0))
-    rewards = rollouts.pessimistic_rewards(smallest, typical)
+    rewards = rollouts.pessimistic_rewards(np.full_like(rollouts.rewards, smallest), typical)
     return average_reward(rewards, env.restart_probability)
 
 

@@ -6,8 +6,9 @@ the best one is kept; the previous policy acts again where it is better by more 
 error.
 
 Far from the samples the model predicts an average reward, which late in learning is a good one.
-So rewards of states that are unlike any sample are shrunk towards the smallest one observed.  The
-explorer, which is optimised with the exploration bonus, gets that bonus there instead.  Rewards are
+So rewards of states that are unlike any sample are shrunk towards that of the same action in the
+worst sampled state; not towards the smallest reward observed, which may be due to the cost of an
+action that the policy does not take.  The explorer, which is optimised with the exploration bonus, gets that bonus there instead.  Rewards are
 not shrunk where episodes terminate: a policy that avoids the termination for longer visits new
 states, and would be rejected for it.
 """
@@ -66,7 +67,7 @@ class ModelComparison:
         elif model_env.dynamics.terminations is not None:
             rewards = each.rewards
         else:
-            rewards = each.pessimistic_rewards(world.reward_model.smallest, self.typical)
+            rewards = each.pessimistic_rewards(self._in_worst_state(each.actions), self.typical)
         return average_reward(rewards, model_env.restart_probability)
 
     @cached_property
@@ -74,6 +75,23 @@ class ModelComparison:
         """The model whose rollouts all begin in start states, with what it computes only once."""
         assert self.world.model_env is not None
         return replace(self.world.model_env, exploring_starts=0.0)
+
+    @cached_property
+    def _worst_state(self) -> FloatArray:
+        """The sampled state (ds,) with the smallest predicted reward, all with the same action."""
+        states = self.world.states
+        same = np.zeros((len(states), self.world.task.action_size))  # the middle of the range
+        inputs = np.concatenate([states, same], axis=1)
+        rewards = self.world.reward_model(inputs, np.zeros(len(states)))
+        return states[int(np.argmin(rewards))]
+
+    def _in_worst_state(self, actions: FloatArray) -> FloatArray:
+        """Predicted rewards (steps, count) of actions (steps, count, da) in the worst state."""
+        flat = actions.reshape(-1, actions.shape[-1])
+        states = np.broadcast_to(self._worst_state, (len(flat), len(self._worst_state)))
+        inputs = np.concatenate([states, flat], axis=1)
+        rewards = self.world.reward_model(inputs, np.zeros(len(flat)))
+        return rewards.reshape(actions.shape[:2])
 
     @cached_property
     def typical(self) -> float:

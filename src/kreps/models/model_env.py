@@ -47,23 +47,26 @@ class ModelRollouts:
 
     Attributes:
         rewards: (steps, count) expected, standardised; after a termination that of no reward.
+        actions: (steps, count, da) applied, in units of their scale.
         similarity: (steps, count) of each state to its nearest sample: the kernel's value, up to 1.
         ended: (steps, count) whether the episode had terminated at an earlier step.
     """
 
     rewards: FloatArray
+    actions: FloatArray
     similarity: FloatArray
     ended: BoolArray
 
-    def pessimistic_rewards(self, smallest: float, typical: float) -> FloatArray:
-        """Rewards (steps, count), shrunk towards the smallest one where no sample is similar.
+    def pessimistic_rewards(self, worst: FloatArray, typical: float) -> FloatArray:
+        """Rewards (steps, count), shrunk towards worse ones where no sample is similar.
 
         Args:
-            smallest: of all observed rewards, standardised.
+            worst: (steps, count) reward of the same action in the worst sampled state.
             typical: similarity from which on a reward is used as predicted.
         """
+        worst = np.minimum(worst, self.rewards)
         known = np.minimum(self.similarity / typical, 1.0)
-        return smallest + known * (self.rewards - smallest)
+        return worst + known * (self.rewards - worst)
 
 
 def average_reward(rewards: FloatArray, restart_probability: float) -> FloatArray:
@@ -200,10 +203,13 @@ class ModelEnv:
             ended.append(over)
             over = over | step.terminated
             states = step.successors
-        rewards = reward(np.concatenate(inputs), np.concatenate(terminations))
-        rewards = np.where(np.concatenate(ended), self.end_reward, rewards)
-        shape = steps, count
-        return ModelRollouts(rewards.reshape(shape), np.stack(similarity), np.stack(ended))
+        rewards = reward(np.concatenate(inputs), np.concatenate(terminations)).reshape(steps, count)
+        return ModelRollouts(
+            rewards=np.where(np.stack(ended), self.end_reward, rewards),
+            actions=np.stack(inputs)[:, :, self.task.observation_size :],
+            similarity=np.stack(similarity),
+            ended=np.stack(ended),
+        )
 
     def trajectories(
         self, policy: StochasticPolicy, starts: FloatArray, steps: int, rng: np.random.Generator
