@@ -16,8 +16,6 @@ PolicyFitName = Literal["map", "bounded"]
 AngleWrap = Literal["discontinuous", "continuous"]
 Noise = Literal["bang-bang", "gaussian", "pink"]
 
-LAGS = f'a whole number from 0 to {MAX_LAGS}, or history = "auto" to choose both'
-
 USUAL_RESTART_PROBABILITY = 0.02
 """That of the paper, with rollouts of 49 steps on average."""
 
@@ -246,8 +244,9 @@ class Settings(OnPolicySettings):
         action_repeat: steps of the environment for which an action is held; those that are held
             together are one step for the learner, with the sum of their rewards.  None is chosen
             from the control period, by `kreps.learning.timescale.action_repeat`.
-        delay, history: earlier actions, and earlier steps with observation and action, in a state
-            (docs/delays.md).  ``history="auto"`` chooses both by held-out error.
+        delay: number of earlier actions in a state (docs/delays.md).
+        history: number of earlier steps, with observation and action, in a state; ``"auto"``
+            chooses both by held-out error.
         kl_bound: epsilon of Eq. 2 in nats: largest relative entropy between the state-action
             distribution after an update and that of the samples.
         eta_floor: smallest temperature, in standard deviations of the reward.  Near convergence the
@@ -299,8 +298,9 @@ class Settings(OnPolicySettings):
         if self.action_repeat is not None:
             limit = f"a whole number from 1 to {MAX_ACTION_REPEAT}, or None to choose it"
             self._check("action_repeat", Integral, limit, lambda v: 1 <= v <= MAX_ACTION_REPEAT)
+        lags = f'a whole number from 0 to {MAX_LAGS}, or history="auto" to choose both'
         for name in ("delay", "history") if self.history != "auto" else ("delay",):
-            self._check(name, Integral, LAGS, lambda v: 0 <= v <= MAX_LAGS)
+            self._check(name, Integral, lags, lambda v: 0 <= v <= MAX_LAGS)
         if self.ridge is not None:
             self._check("ridge", Real, "positive and finite, or None", lambda v: 0 < v < inf)
         if self.eta_floor is not None:
