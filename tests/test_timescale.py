@@ -1,4 +1,4 @@
-"""What is read of an environment's time, and the restart probability that follows from it."""
+"""What is read of an environment's time, and the restart probability."""
 
 from __future__ import annotations
 
@@ -139,29 +139,21 @@ def test_impossible_times_are_refused(wrong: dict[str, Any]) -> None:
 # ---- what follows -----------------------------------------------------------------------------
 
 
-def chosen(limit: int | None, terminated: bool = False, **settings: Any) -> float:
-    task = kreps.TaskSpec(1, [-1.0], [1.0], time_limit=limit)
-    return restart_probability(settings_of(**settings), task, terminated)
-
-
-@pytest.mark.parametrize(
-    ("limit", "p"),
-    [(1, 1 / 50), (50, 1 / 50), (80, 1 / 80), (200, 1 / 200), (1000, 1 / 200), (10**9, 1 / 200)],
-)
-def test_rollouts_are_as_long_as_episodes_from_50_to_200_steps(limit: int, p: float) -> None:
-    assert chosen(limit) == chosen(limit, terminated=True) == p
-
-
-def test_without_a_limit_rollouts_are_those_of_the_paper_until_an_episode_terminates() -> None:
-    assert chosen(None) == 0.02
-    assert chosen(None, terminated=True) == 0.005
+def test_rollouts_are_those_of_the_paper_until_an_episode_terminates() -> None:
+    assert restart_probability(settings_of(), terminated=False) == 0.02
+    assert restart_probability(settings_of(), terminated=True) == 0.005
 
 
 def test_a_number_of_the_user_or_of_a_preset_wins() -> None:
-    assert chosen(80, restart_probability=0.3) == 0.3
-    task = kreps.TaskSpec(1, [-1.0], [1.0], time_limit=80)
+    assert restart_probability(settings_of(restart_probability=0.3), terminated=True) == 0.3
     for preset in ("paper", "single_step"):
-        assert restart_probability(settings_of(preset), task, True) == 0.02
+        assert restart_probability(settings_of(preset), terminated=True) == 0.02
+
+
+@pytest.mark.parametrize("limit", [20, 1_000])
+def test_a_time_limit_changes_no_horizon(limit: int) -> None:
+    """A longer horizon needs more data: Pendulum-v1, limited to 200 steps, needs twice as many."""
+    assert kreps.KREPS(gym.wrappers.TimeLimit(Line(), limit)).restart_probability == 0.02
 
 
 def test_settings_without_a_learner_have_the_usual_probability() -> None:
@@ -170,9 +162,11 @@ def test_settings_without_a_learner_have_the_usual_probability() -> None:
 
 
 def test_other_learners_can_choose_too() -> None:
-    env = gym.wrappers.TimeLimit(Line(), 80)
-    assert kreps.NPALP(env).restart_probability == 0.02
-    assert kreps.NPALP(env, restart_probability=None).restart_probability == 1 / 80
+    learner = kreps.NPALP(Line(edge=0.5), seed=0, restart_probability=None)
+    assert learner.restart_probability == 0.02
+    learner.learn(1, progress=False)
+    assert learner.restart_probability == 0.005
+    assert kreps.NPALP(Line()).settings.restart_probability == 0.02
 
 
 def test_a_random_restart_wins() -> None:
@@ -181,20 +175,18 @@ def test_a_random_restart_wins() -> None:
         learner = kreps.KREPS(env, **options)
         assert learner.settings.restart_probability == learner.restart_probability == 0.3
     learner = kreps.KREPS(env.env)
-    assert (learner.settings.restart_probability, learner.restart_probability) == (None, 1 / 80)
+    assert (learner.settings.restart_probability, learner.restart_probability) == (None, 0.02)
 
 
 def test_rollouts_update_and_report_have_the_chosen_probability() -> None:
-    seen = []
-    learner = kreps.KREPS(gym.wrappers.TimeLimit(Line(), 80), seed=0, **SMALL)
+    seen: list[float] = []
+    learner = kreps.KREPS(Line(edge=1.5), seed=1, **SMALL)
     learner.learn(
         2, callback=lambda _, report: seen.append(report.restart_probability), progress=False
     )
-    assert seen == [1 / 80, 1 / 80]
-    number = kreps.KREPS(
-        gym.wrappers.TimeLimit(Line(), 80), seed=0, restart_probability=1 / 80, **SMALL
-    ).learn(2, progress=False)
-    assert_same(learner, number)
+    assert seen == [0.02, 0.005]  # the first rollouts showed that episodes terminate
+    number = kreps.KREPS(Line(edge=1.5), seed=1, restart_probability=0.005, **SMALL)
+    assert learner.update_settings == number.update_settings
 
 
 def test_a_termination_is_remembered_when_its_rollout_is_forgotten() -> None:
@@ -223,12 +215,11 @@ def test_a_termination_is_remembered_when_its_rollout_is_forgotten() -> None:
     [
         ({}, False, ""),
         ({}, True, "rollouts of 200 steps on average (an episode has terminated)"),
-        ({"time_limit": 80}, True, "rollouts of 80 steps on average (time limit 80 steps)"),
         (
             {"dt": 0.01, "action_repeat": 4, "time_limit": 1000},
-            False,
+            True,
             "actions held 4 steps (control period 0.01 s), rollouts of 200 decisions on average "
-            "(time limit 1000 steps)",
+            "(an episode has terminated)",
         ),
         ({"dt": 0.01, "action_repeat": 4}, False, "actions held 4 steps (control period 0.01 s)"),
         ({"action_repeat": 4}, False, "actions held 4 steps"),
@@ -250,10 +241,7 @@ def test_nothing_is_said_of_what_was_given() -> None:
 def test_the_progress_begins_with_that_line(capsys: pytest.CaptureFixture[str]) -> None:
     kreps.KREPS(gym.wrappers.TimeLimit(Line(dt=0.02), 120), **SMALL).learn(1)
     first, second, *_ = capsys.readouterr().out.splitlines()
-    assert first == (
-        "actions held 2 steps (control period 0.02 s), rollouts of 60 decisions on average (time "
-        "limit 120 steps)"
-    )
+    assert first == "actions held 2 steps (control period 0.02 s)"
     assert second.startswith("iter 1 ")
     kreps.KREPS(Line(), **SMALL).learn(1)
     assert capsys.readouterr().out.startswith("iter 1 ")
@@ -287,7 +275,7 @@ def test_a_resumed_learner_makes_the_same_choice(limited: bool, tmp_path: Path) 
     assert resumed.restart_probability == part.restart_probability
     assert (resumed.task.dt, resumed.task.time_limit) == (0.05, 60 if limited else None)
     assert_same(whole, resumed.learn(2, progress=False))
-    assert whole.restart_probability == (1 / 60 if limited else 0.005)
+    assert whole.restart_probability == 0.005
 
 
 def test_a_policy_file_has_the_times_of_the_task(tmp_path: Path) -> None:

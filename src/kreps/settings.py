@@ -167,7 +167,7 @@ class LearnerSettings(Checked):
 
     Attributes:
         restart_probability: p, with which the process restarts at each step, in [1e-9, 1).  None
-            is chosen from the task, by `kreps.learning.timescale.restart_probability`.
+            is 0.02, and 0.005 once an episode has terminated.
         window: largest number of rollouts in the replay window, a third of them reserved for those
             with a state-dependent reward.  None keeps all.
         window_steps: smallest number of steps in the window, for which more rollouts are kept than

@@ -8,9 +8,9 @@ error.
 Far from the samples the model predicts an average reward, which late in learning is a good one.
 So rewards of states that are unlike any sample are shrunk towards that of the same action in the
 worst sampled state; not towards the smallest reward observed, which may be due to the cost of an
-action that the policy does not take.  The explorer, which is optimised with the exploration bonus, gets that bonus there instead.  Rewards are
-not shrunk where episodes terminate: a policy that avoids the termination for longer visits new
-states, and would be rejected for it.
+action that the policy does not take.  The explorer, which is optimised with the exploration bonus,
+gets that bonus there instead.  Rewards are not shrunk where episodes terminate: a policy that
+avoids the termination for longer visits new states, and would be rejected for it.
 """
 
 from __future__ import annotations

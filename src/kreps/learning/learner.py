@@ -141,7 +141,7 @@ class Learner(Generic[MethodSettings]):
     @property
     def restart_probability(self) -> float:
         """p of the next rollouts and the next update: that of the settings, or as chosen."""
-        return timescale.restart_probability(self.settings, self.task, self.state.terminated)
+        return timescale.restart_probability(self.settings, self.state.terminated)
 
     @property
     def update_settings(self) -> MethodSettings:

@@ -13,12 +13,8 @@ from kreps.settings import USUAL_RESTART_PROBABILITY, LearnerSettings, Settings
 DECISION_PERIOD = 0.04
 """Seconds for which an action is held, where that can be chosen: 25 decisions per second."""
 
-LENGTHS = 50, 200
-"""Smallest and largest number of steps of a rollout that is chosen, on average."""
-
 ENDING = 0.005
-"""Restart probability where an episode has terminated, and no time limit is known: what matters may
-happen late in an episode."""
+"""Restart probability where an episode has terminated: what matters may happen late in one."""
 
 
 def action_repeat(settings: Settings, task: TaskSpec) -> int:
@@ -33,23 +29,16 @@ def action_repeat(settings: Settings, task: TaskSpec) -> int:
     return min(max(round(DECISION_PERIOD / task.dt), 1), MAX_ACTION_REPEAT)
 
 
-def restart_probability(settings: LearnerSettings, task: TaskSpec, terminated: bool) -> float:
-    """p: that of the settings, or ``1 / clip(T, 50, 200)`` for episodes of at most T decisions.
-
-    Without a known time limit it is 0.02, as in the paper, until an episode has terminated, and
-    0.005 from then on.
+def restart_probability(settings: LearnerSettings, terminated: bool) -> float:
+    """p: that of the settings, or 0.02 until an episode has terminated, and 0.005 from then on.
 
     Args:
         settings: of the learner.
-        task: with T, its ``time_limit`` over its ``action_repeat``.
         terminated: whether any episode so far ended by a termination.
     """
     if settings.restart_probability is not None:
         return settings.restart_probability
-    if task.decisions is None:
-        return ENDING if terminated else USUAL_RESTART_PROBABILITY
-    least, most = LENGTHS
-    return 1.0 / min(max(task.decisions, least), most)
+    return ENDING if terminated else USUAL_RESTART_PROBABILITY
 
 
 def choices(settings: LearnerSettings, task: TaskSpec, terminated: bool) -> str:
@@ -58,11 +47,7 @@ def choices(settings: LearnerSettings, task: TaskSpec, terminated: bool) -> str:
     if repeat > 1 and getattr(settings, "action_repeat", repeat) is None:
         period = "" if task.dt is None else f" (control period {task.dt:g} s)"
         said.append(f"actions held {repeat} steps{period}")
-    if settings.restart_probability is None:
+    if settings.restart_probability is None and terminated:
         unit = "steps" if repeat == 1 else "decisions"
-        length = f"rollouts of {1.0 / restart_probability(settings, task, terminated):.0f} {unit}"
-        if task.time_limit is not None:
-            said.append(f"{length} on average (time limit {task.time_limit} steps)")
-        elif terminated:
-            said.append(f"{length} on average (an episode has terminated)")
+        said.append(f"rollouts of {1.0 / ENDING:.0f} {unit} on average (an episode has terminated)")
     return ", ".join(said)
