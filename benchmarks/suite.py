@@ -1,18 +1,19 @@
-"""Tasks that nobody tuned on: writes ``results/suite.csv`` and ``results/suite.md``.
+"""Tasks that nobody tuned on: writes ``results/suite.json`` and ``results/suite.md``.
 
     pip install -r benchmarks/suite_requirements.txt
     python benchmarks/suite.py --seeds 20 21 22 --workers 2
 
 `KREPS(env)` alone, without any setting.  The score is what users of these tasks quote: the
-undiscounted return of the greedy policy over whole episodes.  Runs that the csv already has are not
-made again, unless it is of another commit (``--again``).
+undiscounted return of the greedy policy over whole episodes.  Runs of the same commit that the file
+already has are not made again.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
+import json
 import os
+import sys
 import time
 import warnings
 from collections import defaultdict
@@ -34,7 +35,6 @@ from kreps.experiments.tables import markdown
 RESULTS = Path(__file__).parents[1] / "results"
 EPISODES = 10
 """Evaluated episodes, from fixed start states."""
-COLUMNS = ("task", "seed", "steps", "mean", "worst_episode", "cpu_seconds", "commit")
 
 
 class IdleColumns(gym.ObservationWrapper[Any, Any, Any]):
@@ -136,43 +136,38 @@ def run(name: str, seed: int) -> dict[str, Any]:
         "mean": round(float(np.mean(returns)), 3),
         "worst_episode": round(float(np.min(returns)), 3),
         "cpu_seconds": round(cpu, 1),
-        "commit": commit(),
     }
 
 
-def read() -> list[dict[str, Any]]:
-    file = RESULTS / "suite.csv"
-    if not file.exists():
-        return []
-    with file.open(newline="") as lines:
-        return list(csv.DictReader(lines))
-
-
-def write(rows: list[dict[str, Any]]) -> None:
-    order = list(TASKS)
-    rows.sort(key=lambda row: (order.index(row["task"]), int(row["seed"])))
-    with (RESULTS / "suite.csv").open("w", newline="") as lines:
-        writer = csv.DictWriter(lines, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+def table(results: list[dict[str, Any]]) -> str:
+    """The table of all runs, a row per task."""
     by_task = defaultdict(list)
-    for row in rows:
-        by_task[row["task"]].append(row)
-    table = []
-    for name, found in by_task.items():
-        means = [float(row["mean"]) for row in found]
-        table.append(
+    for run in results:
+        by_task[run["task"]].append(run)
+    rows = []
+    for name, runs in by_task.items():
+        means = [run["mean"] for run in runs]
+        rows.append(
             [
                 name,
                 f"{TASKS[name].solved:g}",
-                f"{np.mean([int(row['steps']) for row in found]):.0f}",
+                f"{np.mean([run['steps'] for run in runs]):.0f}",
                 f"{np.mean(means):.1f} ({min(means):.1f})",
                 ", ".join(f"{mean:.1f}" for mean in means),
-                f"{np.mean([float(row['cpu_seconds']) for row in found]):.0f}",
+                f"{np.mean([run['cpu_seconds'] for run in runs]):.0f}",
             ]
         )
     head = ["task", "solved", "steps", "return: mean (worst seed)", "by seed", "CPU s"]
-    (RESULTS / "suite.md").write_text(markdown(head, table) + "\n")
+    return markdown(head, rows)
+
+
+def write(results: list[dict[str, Any]]) -> None:
+    order = list(TASKS)
+    results.sort(key=lambda run: (order.index(run["task"]), run["seed"]))
+    command = " ".join(["python benchmarks/suite.py", *sys.argv[1:]])
+    content = {"command": command, "commit": commit(), "results": results}
+    (RESULTS / "suite.json").write_text(json.dumps(content, indent=2) + "\n")
+    (RESULTS / "suite.md").write_text(table(results) + "\n")
 
 
 def main() -> None:
@@ -180,16 +175,18 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[20, 21, 22])
     parser.add_argument("--tasks", nargs="+", choices=list(TASKS), default=list(TASKS))
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--again", action="store_true", help="make runs of other commits again")
     args = parser.parse_args()
-    rows = [row for row in read() if not args.again or row["commit"] == commit()]
-    done = {(row["task"], int(row["seed"])) for row in rows}
+    results, file = [], RESULTS / "suite.json"
+    if file.exists():
+        before = json.loads(file.read_text())
+        results = before["results"] if before["commit"] == commit() else []
+    done = {(run["task"], run["seed"]) for run in results}
     jobs = [(task, seed) for seed in args.seeds for task in args.tasks if (task, seed) not in done]
     with ProcessPoolExecutor(args.workers) as pool:
-        for row in pool.map(run, *zip(*jobs, strict=True)) if jobs else ():
-            rows.append(row)
-            write(rows)
-            print({**row}, flush=True)
+        for found in pool.map(run, *zip(*jobs, strict=True)) if jobs else ():
+            results.append(found)
+            write(results)
+            print(found, flush=True)
 
 
 if __name__ == "__main__":

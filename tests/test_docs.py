@@ -21,6 +21,7 @@ import delays  # noqa: E402
 import peers_seconds  # noqa: E402
 import peers_table  # noqa: E402
 import robot_time  # noqa: E402
+import suite  # noqa: E402
 from fill_tables import filled  # noqa: E402
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -93,6 +94,9 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
             assert table == search_table(content)
         elif name == "delays":
             assert table == delays.table(content["results"]).strip()
+            assert "+" not in content["commit"]
+        elif name == "suite":
+            assert table == suite.table(content["results"])
             assert "+" not in content["commit"]
         elif name == "peers-seconds":
             assert table == peers_seconds.table(content["rows"])
