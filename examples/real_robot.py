@@ -52,5 +52,5 @@ with started(args.speed) as (_, link):
                 sent = [torque, sent[0]]
                 message = receive()
                 torque = robot.act([*message[1:], *sent]).item()
-            send(torque=torque)  # the stop action
+            send(torque=robot.stop_action.item())
         print(f"{robot.missed_deadlines} actions came more than half a period late")

@@ -371,6 +371,32 @@ def test_leaving_the_block_in_a_rollout_stops_the_robot(tmp_path: Path) -> None:
         robot.act([0.0, 0.0])
         _ = 1 / 0
     assert sent == [0.0]
+    # also before the first action, and after an abort
+    with pytest.raises(ZeroDivisionError), session as robot:
+        next(robot.rollouts(1))
+        _ = 1 / 0
+    with pytest.raises(ZeroDivisionError), session as robot:
+        robot.abort()  # no rollout is running
+        next(robot.rollouts(1))
+        robot.act([0.0, 0.0])
+        robot.abort()
+        _ = 1 / 0
+    assert sent == [0.0] * 3
+
+
+def test_a_session_goes_on_with_the_history_that_its_updates_have_chosen(tmp_path: Path) -> None:
+    def opened() -> Any:
+        ours = kreps.KREPS(kreps.TaskSpec(1, [-1.0], [1.0], dt=0.1), history="auto")
+        return ours, ours.session(tmp_path)
+
+    ours, session = opened()
+    ours.state = ours.state.with_history(1, 0)
+    ours.task = ours.state.window.task
+    ours.save(tmp_path / "checkpoint.safetensors")
+    (tmp_path / "rollouts").mkdir()
+    again, session = opened()
+    with session:
+        assert (again.task.delay, again.task.history) == (1, 0)
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -72,10 +72,13 @@ class Journal:
         state, task, settings, seed = load_checkpoint(
             self.checkpoint_file, learner.method, learner.settings_type
         )
+        made = learner.task
+        if getattr(settings, "history", 0) == "auto":  # the updates have chosen both since
+            made = replace(made, delay=task.delay, history=task.history)
         differing = [
             name
             for name, same in (
-                ("task", _same(task, learner.task)),
+                ("task", _same(task, made)),
                 ("settings", settings == learner.settings),
                 ("seed", seed == learner.seed),
             )

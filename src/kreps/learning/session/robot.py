@@ -80,6 +80,7 @@ class RobotSession:
             )
         self.period = period
         self.stop_action = task.given_spaces.actions(values)
+        self.stop_action.flags.writeable = False
         self.missed_deadlines = 0
         self._learner, self._journal = learner, Journal(folder)
         self._stop, self._patience, self._clock = stop, watchdog * period, clock
@@ -106,10 +107,12 @@ class RobotSession:
         assert self._open is not None
         with self._open, self._lock:
             rollout, self._rollout, self._open = self._rollout, None, None
-            if rollout is not None and rollout.end is not None:
-                self._recorded(rollout)
-            elif rollout is not None and rollout.acting and self._stop is not None:
+            if rollout is None:
+                return
+            if rollout.end in (None, End.ABORTED) and self._stop is not None:
                 self._stop(self.stop_action)
+            if rollout.end is not None:
+                self._recorded(rollout)
 
     # ---- between rollouts ---------------------------------------------------------------------
 
@@ -139,6 +142,7 @@ class RobotSession:
             EnvironmentFailure: a rollout was ended three times before its first step was complete.
             StorageError: a rollout cannot be written, or one that was recorded is damaged.
         """
+        self._check_open()
         callbacks, learner = callbacks_of(callback), self._learner
         if progress:
             from kreps.learning.progress import ProgressTable
@@ -182,12 +186,15 @@ class RobotSession:
                 rollouts = Rollouts.from_list([each.rollout for each in made])
                 return Collected(rollouts, done.value), sum(each.cycles for each in made)
 
-    def _begin(self, policy: StochasticPolicy, planned: PlannedRollout) -> None:
+    def _check_open(self) -> None:
         if self._open is None:
             raise ConfigurationError(
                 "the session is not open; write `with learner.session(...) as robot:` and loop "
                 "over its rollouts inside that block"
             )
+
+    def _begin(self, policy: StochasticPolicy, planned: PlannedRollout) -> None:
+        self._check_open()
         task = self._learner.task
         # what the policy computes once is computed now, so that the first action is not late
         with default_errstate():
@@ -290,10 +297,10 @@ class RobotSession:
             self._clock.sleep(max(0.0, due - self._clock.monotonic()))
 
     def abort(self) -> None:
-        """End the rollout; its complete steps are kept, and nothing happens if it is over."""
+        """End the rollout; its complete steps are kept, and nothing happens if none is running."""
         with self._lock:
-            rollout = self._current()
-            rollout.end = rollout.end or End.ABORTED
+            if self._rollout is not None:
+                self._rollout.end = self._rollout.end or End.ABORTED
 
     def _current(self) -> RolloutInProgress:
         if self._rollout is None:
