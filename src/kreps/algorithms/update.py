@@ -19,7 +19,7 @@ from kreps.algorithms.model_based import (
 from kreps.algorithms.report import UpdateInfo
 from kreps.algorithms.reps import Batch, Step, reps_step, stationarity_ridge
 from kreps.algorithms.state import LearnerState, Stopwatch
-from kreps.data.compute import Compute
+from kreps.data.compute import CHUNK_SIZE, Compute
 from kreps.data.dataset import Dataset
 from kreps.data.rollouts import Rollout
 from kreps.errors import ConfigurationError
@@ -75,12 +75,12 @@ def history_choice(
 ) -> HistoryChoice | None:
     """Delay and history of the states of this update, where the settings leave them open.
 
-    They are chosen from all rollouts of the window, or from the first chunk of a data set.
+    They are chosen from all rollouts of the window, or from the first ones of a data set.
     """
     if settings.history != "auto":
         return None
     if isinstance(samples, Dataset):
-        rollouts = samples.chunks[0].load()
+        rollouts = samples.first(CHUNK_SIZE)
     else:
         rollouts = state.append(samples).rollouts
     return choose_history(rollouts, state.window.task, settings.delay, rng)

@@ -148,6 +148,11 @@ class Dataset:
         """The parts of ``values`` (n, ...) that belong to each chunk."""
         return np.split(values, self.offsets[1:-1])
 
+    def first(self, steps: int) -> Rollouts:
+        """The rollouts of the first chunks, of as many as have so many samples, or of all."""
+        count = int(np.searchsorted(self.offsets[1:], steps)) + 1
+        return Rollouts.from_list([each for chunk in self.chunks[:count] for each in chunk.load()])
+
     def take(self, rows: IntArray) -> Transitions:
         """The samples of these numbers, which must ascend."""
         parts = []

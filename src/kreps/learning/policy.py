@@ -191,11 +191,14 @@ class Policy:
     def export_onnx(self, path: str | Path, dtype: str = "float64") -> str:
         """Write an ONNX model of the policy without exploration, for controllers in any language.
 
-        Its input is ``observation`` (batch, ds).  Its outputs are ``action`` (batch, da), the mean
+        Its input is ``observation`` (batch, do).  Its outputs are ``action`` (batch, da), the mean
         clipped to the task's limits, and ``standard_deviation`` (batch, da) of the commanded
-        action, both in the task's units.  The metadata have ``action_repeat``, the control periods
-        (of ``dt`` in s) for which the controller has to hold an action.  If an observation or a
-        result is NaN or infinite, the model ends with an error in place of an action.
+        action, both in the task's units.  A policy that needs earlier steps has also the input
+        ``lags`` and the output ``next_lags`` (batch, h do + k da), which is the next input: once
+        per decision, not per control period (docs/delays.md).  The metadata have
+        ``action_repeat``, the control periods (of ``dt`` in s) for which the controller has to hold
+        an action.  If an observation or a result is NaN or infinite, the model ends with an error
+        in place of an action.
         `kreps.check_file` tells whether a copy of the model is undamaged.
 
         Args:

@@ -14,7 +14,7 @@ import numpy as np
 
 from kreps.data.history import stacked
 from kreps.data.rollouts import Rollouts, Transitions
-from kreps.data.task import TaskSpec
+from kreps.data.task import MAX_LENGTHSCALES, TaskSpec
 from kreps.kernels.arrays import FloatArray, IntArray
 from kreps.kernels.regression import KernelEmbedding
 from kreps.kernels.sampling import uniform_subsample
@@ -226,5 +226,10 @@ def candidates(task: TaskSpec, length: float) -> list[TaskSpec]:
     given = task.delay
     pairs = {(given + delay, 0) for delay in range(lag + 1)}
     pairs |= {(given, history) for history in range(min(lag, MAX_HISTORY) + 1)}
-    tasks = [replace(task, delay=delay, history=history) for delay, history in pairs]
+    factors, actions = task.factor_count - task.action_size * task.action_lags, task.action_size
+    tasks = [
+        replace(task, delay=delay, history=history)
+        for delay, history in pairs
+        if factors * (1 + history) + actions * max(delay, history) <= MAX_LENGTHSCALES
+    ]
     return sorted(tasks, key=lambda each: (each.state_size, each.history))

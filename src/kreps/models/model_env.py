@@ -206,7 +206,7 @@ class ModelEnv:
         rewards = reward(np.concatenate(inputs), np.concatenate(terminations)).reshape(steps, count)
         return ModelRollouts(
             rewards=np.where(np.stack(ended), self.end_reward, rewards),
-            actions=np.stack(inputs)[:, :, self.task.observation_size :],
+            actions=np.stack(inputs)[:, :, self.task.state_size :],
             similarity=np.stack(similarity),
             ended=np.stack(ended),
         )
