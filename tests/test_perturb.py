@@ -458,3 +458,33 @@ def test_a_learner_learns_from_a_perturbed_environment_in_lock_step() -> None:
     assert batch_model_of(learner.env) is not None and learner.task.periodic == (0,)  # type: ignore[arg-type]
     learner.learn(2, progress=False)
     assert learner.state.window.rollouts.points.shape[1] == 2
+
+
+def test_a_command_without_some_coordinates_is_refused() -> None:
+    env = gym.make("kreps/Reaching-v0")
+    with pytest.raises(SpaceError, match="number of action coordinates from 2 to 1"):
+        Perturbed(env, actions=[Hidden(0)])
+
+
+class Counting(gym.Env[Any, Any]):
+    """Takes whole numbers, and keeps the last one."""
+
+    observation_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float64)
+    action_space = gym.spaces.Box(0, 10, (1,), np.int64)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        return np.zeros(1), {}
+
+    def step(self, action: Any) -> Any:
+        self.got = action
+        return np.zeros(1), 0.0, False, False, {}
+
+
+def test_whole_commands_are_rounded_to_the_nearest() -> None:
+    inside = Counting()
+    env = Perturbed(inside, actions=[Lag(1.0)])
+    env.reset(seed=0)
+    for _ in range(8):
+        env.step(np.array([3]))
+    assert inside.got.dtype == np.int64 and inside.got.tolist() == [3]

@@ -123,6 +123,12 @@ class Perturbed(gym.Wrapper[Any, Any, Any, Any]):
             ),
             tuple(actions),
         )
+        if len(self.actuators.output) != len(self.actuators.source):
+            raise SpaceError(
+                f"actions = {list(actions)} change the number of action coordinates from "
+                f"{len(self.actuators.source)} to {len(self.actuators.output)}, but the "
+                "environment needs all of them; perturb observations by it"
+            )
         source = Signal.from_space(
             _box("observation", env.observation_space),
             (known or {}).get("periodic_coordinates", ()),
@@ -167,9 +173,9 @@ class Perturbed(gym.Wrapper[Any, Any, Any, Any]):
         limits = self.actuators.source
         command = limits.clip(_row("actions", action, limits))
         actuators, applied = self.actuators.step(actuators, command, rngs)
-        observation, reward, terminated, truncated, info = self.env.step(
-            limits.clip(applied)[0].astype(self.env.action_space.dtype)
-        )
+        dtype = np.dtype(self.env.action_space.dtype)
+        applied = limits.clip(np.rint(applied) if dtype.kind in "iu" else applied)
+        observation, reward, terminated, truncated, info = self.env.step(applied[0].astype(dtype))
         seen = _row("observations", observation, self.sensors.source)
         sensors, sensed = self.sensors.step(sensors, seen, rngs)
         self._states = actuators, sensors
