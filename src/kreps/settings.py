@@ -180,7 +180,7 @@ class LearnerSettings(Checked):
 
     def __post_init__(self) -> None:
         if self.restart_probability is not None:
-            limit = "at least 1e-9 and below 1, or None to choose it from the task"
+            limit = "at least 1e-9 and below 1, or None for the default"
             self._check("restart_probability", Real, limit, lambda v: 1e-9 <= v < 1)
         whole = f"a whole number from 0 to {MAX_WHOLE_NUMBER}"
         self._check("window_steps", Integral, whole, lambda v: 0 <= v <= MAX_WHOLE_NUMBER)
@@ -190,10 +190,7 @@ class LearnerSettings(Checked):
 
     @property
     def p(self) -> float:
-        """The restart probability: that of a task of which nothing is known where it is None.
-
-        A learner chooses a number before it makes an update.
-        """
+        """The restart probability; 0.02 where a learner is still to choose it."""
         given = self.restart_probability
         return USUAL_RESTART_PROBABILITY if given is None else given
 
