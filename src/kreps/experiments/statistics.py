@@ -86,7 +86,7 @@ def effect_of(
         resampled.append(_location(drawn, trimmed)[0])
     variances = [float(variance) for _, variance, _ in found]
     freedom = found[0][2]
-    if len(found) == 2 and sum(variances):  # Welch
+    if len(found) == 2 and sum(variances) > 0.0:  # Welch
         parts = (v**2 / f for v, (_, _, f) in zip(variances, found, strict=True))
         freedom = sum(variances) ** 2 / sum(parts)
     return Effect(

@@ -10,13 +10,13 @@ import typer
 from kreps.app.cli.paths import PATH
 from kreps.app.console import say_command
 from kreps.errors import ConfigurationError
-from kreps.experiments.claims import write_claims
 from kreps.experiments.executors import executor
 from kreps.experiments.figures import draw_features, write_figure
 from kreps.experiments.runner import figure_trials, run_trials
 from kreps.experiments.search import CANDIDATES, search_trials, write_search
 from kreps.experiments.specs import EXTRA_EXPERIMENTS, FIGURES, FIRST_SEED, PICTURES
 from kreps.experiments.trials import name_of
+from kreps.experiments.verdicts import write_claims
 
 REPRODUCE_EXAMPLES = (
     "kreps reproduce figure-1b --trials 10 --workers 2",
