@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from kreps.experiments.claims import claims_table, write_claims
 from kreps.experiments.figures import markdown_table, named_rows, steps_table
 from kreps.experiments.search import search_table
+from kreps.experiments.verdicts import claims_table, write_claims
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "benchmarks")]

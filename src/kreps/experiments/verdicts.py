@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from kreps.errors import StorageError
-from kreps.experiments.claims import CLAIMS, EARLY, LATE, MARGINS, Claim, Kind, Measure, Rows
+from kreps.experiments.claims import CLAIMS, EARLY, LATE, MARGINS, Claim, Kind, Rows
 from kreps.experiments.figures import named_rows
 from kreps.experiments.statistics import (
     QUARTER,
@@ -75,14 +75,14 @@ class Comparison:
         return effect_of(self.samples, generator(0, Purpose.BOOTSTRAP), trimmed=trimmed)
 
 
-def by_seed(rows: Rows, curve: str, measure: Measure, iterations: int) -> dict[int, float]:
-    """The measure of each seed of a curve, from its first ``iterations`` rows."""
+def by_seed(rows: Rows, curve: str, iterations: int) -> dict[int, Rows]:
+    """The first ``iterations`` rows of each seed of a curve, in their order."""
     grouped: dict[int, list[Mapping[str, str]]] = {}
     for row in rows:
         if row["method"] == curve and int(row["iteration"]) <= iterations:
             grouped.setdefault(int(row["seed"]), []).append(row)
     return {
-        seed: measure(sorted(grouped[seed], key=lambda row: int(row["iteration"])))
+        seed: sorted(grouped[seed], key=lambda row: int(row["iteration"]))
         for seed in sorted(grouped)
     }
 
@@ -117,16 +117,17 @@ def compare(claim: Claim, rows: Rows) -> Comparison | None:
     rows = named_rows(rows)
     curves = [claim.better] if claim.worse is None else [claim.better, claim.worse]
     iterations = common_iterations(rows, curves)
-    values = [by_seed(rows, curve, claim.measure, iterations) for curve in curves]
-    seeds = tuple(map(len, values))
+    of_curves = [by_seed(rows, curve, iterations) for curve in curves]
+    seeds = tuple(map(len, of_curves))
     if not all(seeds):
         return None
     paired = len(curves) == 2 and share_first_rollouts(rows, curves)
-    samples = tuple(np.array(list(each.values())) for each in values)
-    if paired:
-        samples = (samples[0] - samples[1],)
-    known = not too_few(seeds, iterations)
-    return Comparison(claim, iterations, seeds, paired, samples if known else ())
+    samples: list[FloatArray] = []
+    if not too_few(seeds, iterations):
+        samples = [np.array(list(map(claim.measure, each.values()))) for each in of_curves]
+        if paired:
+            samples = [samples[0] - samples[1]]
+    return Comparison(claim, iterations, seeds, paired, tuple(samples))
 
 
 def too_few(seeds: Sequence[int], iterations: int) -> str:
