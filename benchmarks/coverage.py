@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import bootstrap, trim_mean
 
+from kreps.experiments.fingerprint import script_fingerprint
 from kreps.experiments.provenance import commit
 from kreps.experiments.statistics import QUARTER, effect_of
 from kreps.experiments.tables import markdown
@@ -142,6 +143,7 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=1000)
     parser.add_argument("--out", type=Path, default=Path("results"))
     arguments = parser.parse_args()
+    source, code = commit(), script_fingerprint(Path(__file__))
     rows: list[dict[str, Any]] = []
     for seeds in (10, 30):
         for name, draws in CASES.items():
@@ -153,12 +155,13 @@ def main() -> None:
             print(rows[-1], flush=True)
     content = {
         "command": "python benchmarks/coverage.py",
-        "commit": commit(),
+        "commit": source,
         "versions": versions(),
         "samples": arguments.samples,
         "resamples": RESAMPLES,
         "levels": [LEVEL, CORRECTED],
         "rows": rows,
+        "code": code,
     }
     (arguments.out / "coverage.json").write_text(json.dumps(content, indent=1) + "\n")
     (arguments.out / "coverage.md").write_text(table(rows) + "\n")

@@ -22,6 +22,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from kreps import plotting
+from kreps.experiments.fingerprint import script_fingerprint
 from kreps.experiments.provenance import commit
 from kreps.kernels.threads import blas_threads
 from kreps.learning.collect import collect
@@ -127,6 +128,7 @@ def main() -> None:
     content = {
         "command": "python benchmarks/delays.py",
         "commit": commit(),
+        "code": script_fingerprint(Path(__file__)),
         "rollouts": ROLLOUTS,
         "results": found,
     }

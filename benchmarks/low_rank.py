@@ -28,6 +28,7 @@ from matplotlib.figure import Figure
 import kreps
 from kreps.data.compute import CHUNK_SIZE
 from kreps.data.task import TaskSpec
+from kreps.experiments.fingerprint import script_fingerprint
 from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
 from kreps.kernels.basis import RKHSBasis
@@ -50,7 +51,8 @@ def write(out: Path, name: str, content: dict[str, Any], figure: Figure, table: 
     """Write numbers, picture and table, with the command and the commit that made them."""
     command = f"python benchmarks/low_rank.py {name}"
     out.mkdir(parents=True, exist_ok=True)
-    text = json.dumps({"command": command, "commit": commit(), **content}, indent=2)
+    source = {"command": command, "commit": commit(), "code": script_fingerprint(Path(__file__))}
+    text = json.dumps({**source, **content}, indent=2)
     (out / f"low-rank-{name}.json").write_text(text + "\n")
     (out / f"low-rank-{name}.md").write_text(table + "\n")
     figure.get_layout_engine().set(rect=(0.0, 0.04, 1.0, 0.96))  # room for the source

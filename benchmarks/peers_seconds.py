@@ -24,6 +24,7 @@ from peers import add_tasks, positive, seeds_of, write
 from peers_trials import MARKS, TASKS, Stopwatch, Trial, model_of
 
 import kreps
+from kreps.experiments.fingerprint import script_fingerprint
 from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
 from kreps.kernels.threads import blas_threads
@@ -115,6 +116,7 @@ def main() -> None:
         "command": f"python benchmarks/peers_seconds.py --seeds {options.seeds[0]}-"
         f"{options.seeds[-1]} --steps {options.steps} --tasks {' '.join(options.tasks)}",
         "commit": commit(),
+        "code": script_fingerprint(Path(__file__)),
         "versions": versions(),
     }
     write(options.out / "peers-seconds.json", {**about, "rows": rows}, indent=1)

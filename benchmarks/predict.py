@@ -32,6 +32,7 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 import kreps
+from kreps.experiments.fingerprint import script_fingerprint
 from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
 from kreps.kernels.arrays import FloatArray
@@ -296,6 +297,7 @@ def main() -> None:
     if options.iterations != parser.get_default("iterations"):
         command += f" --iterations {options.iterations}"
     source = commit()  # now: the source tree may change while this runs
+    code = script_fingerprint(Path(__file__))
     load = os.getloadavg()[0]
     assert gc.isenabled()
     with blas_threads(1):
@@ -304,6 +306,7 @@ def main() -> None:
     content = {
         "command": command,
         "commit": source,
+        "code": code,
         "versions": versions(),
         "processors": os.cpu_count(),
         "load_average_at_start": load,

@@ -23,6 +23,7 @@ from scipy.optimize import minimize
 
 from kreps import KREPS
 from kreps.envs.reaching import MAX_TORQUE, ReachingBatch
+from kreps.experiments.fingerprint import script_fingerprint
 from kreps.experiments.provenance import commit
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.evaluate import Greedy, evaluation_rollouts
@@ -101,6 +102,7 @@ def main() -> None:
         "command": f"python benchmarks/reaching_optimum.py --steps {options.steps} "
         f"--starts {options.starts}",
         "commit": commit(),
+        "code": script_fingerprint(Path(__file__)),
         "versions": versions(),
         "average_reward": max(values),
         "by_start": values,

@@ -14,9 +14,12 @@ from measuring import Measured
 from peak import Peak
 from threadpoolctl import threadpool_info
 
+from kreps.experiments.fingerprint import script_fingerprint
 from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
 from kreps.versions import versions
+
+BENCHMARKS = sorted(Path(__file__).parent.glob("bench_*.py"))
 
 HEADINGS = ("work", "size", "CPU s", "MB", "number", "unit", "limit", "met")
 
@@ -35,6 +38,7 @@ def facts(command: str) -> dict[str, Any]:
         "command": command,
         "date": datetime.now(UTC).date().isoformat(),
         "commit": commit(),
+        "code": {k: v for path in BENCHMARKS for k, v in script_fingerprint(path).items()},
         "cpu": _cpu_model(),
         "blas": blas,
         "versions": versions(),

@@ -29,6 +29,7 @@ import gymnasium as gym
 import numpy as np
 
 import kreps
+from kreps.experiments.fingerprint import script_fingerprint
 from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
 
@@ -165,7 +166,8 @@ def write(results: list[dict[str, Any]]) -> None:
     order = list(TASKS)
     results.sort(key=lambda run: (order.index(run["task"]), run["seed"]))
     command = " ".join(["python benchmarks/suite.py", *sys.argv[1:]])
-    content = {"command": command, "commit": commit(), "results": results}
+    code = script_fingerprint(Path(__file__))
+    content = {"command": command, "commit": commit(), "code": code, "results": results}
     (RESULTS / "suite.json").write_text(json.dumps(content, indent=2) + "\n")
     (RESULTS / "suite.md").write_text(table(results) + "\n")
 

@@ -20,6 +20,7 @@ from scipy import sparse
 
 import kreps
 from kreps.envs import swing_up
+from kreps.experiments.fingerprint import script_fingerprint
 from kreps.experiments.provenance import commit
 from kreps.kernels.arrays import FloatArray
 from kreps.learning.environment import task_of
@@ -112,6 +113,7 @@ def main() -> None:
         "command": "python benchmarks/swing_up_optimum.py "
         f"--angles {options.angles} --velocities {options.velocities}",
         "commit": commit(),
+        "code": script_fingerprint(Path(__file__)),
         "versions": versions(),
         "sweeps": sweeps,
         "value_of_the_start_on_the_grid": bound,

@@ -1,11 +1,12 @@
 """Writes the tables of ``results/`` into the documentation pages: ``make tables``.
 
 The text between ``<!-- results: NAME -->`` and ``<!-- end of results -->`` is a copy of
-``results/NAME.md``.
+``results/NAME.md``.  Below it stands whether the result is stale (``results/stale.json``).
 """
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -19,9 +20,15 @@ def filled(text: str, results: Path = ROOT / "results") -> str:
     A table without a result file is removed.
     """
 
+    declared = results / "stale.json"
+    stale = json.loads(declared.read_text()) if declared.exists() else {}
+
     def table(match: re.Match[str]) -> str:
         path = results / f"{match[2]}.md"
         content = path.read_text().strip() + "\n" if path.exists() else ""
+        command = stale.get(match[2].removesuffix("-steps"))
+        if content and command:
+            content += f"\n*Stale: made by older code. To renew: `{command}`.*\n"
         return match[1] + content + match[4]
 
     return SHOWN.sub(table, text)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
 from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,7 @@ import pytest
 
 import kreps
 from kreps.errors import ConfigurationError, StorageError, TrialFailure
-from kreps.experiments import claims, search
-from kreps.experiments.claims import CLAIMS, Claim, Kind, assess, verdict, write_claims
+from kreps.experiments import search
 from kreps.experiments.executors import executor
 from kreps.experiments.figures import (
     draw_features,
@@ -208,159 +206,6 @@ def test_the_candidates_have_the_settings_of_the_committed_search() -> None:
                 assert (settings["model"], settings["policy_fit"]) == printed
 
 
-# ---- claims -----------------------------------------------------------------------------------
-
-
-def rows_with(
-    curve: str, values: Sequence[float], task: str = "reaching", iterations: int = 15
-) -> list[dict[str, str]]:
-    return [
-        {
-            "task": task,
-            "method": curve,
-            "seed": str(seed),
-            "iteration": str(iteration),
-            "stochastic": str(value + 0.001 * iteration),
-            "greedy": str(value),
-        }
-        for seed, value in enumerate(values)
-        for iteration in range(1, iterations + 1)
-    ]
-
-
-def claim_of(better: str, worse: str | None, kind: Kind = Kind.BETTER, **changes: Any) -> Claim:
-    return Claim("a claim", "figure-1b", better, worse, changes.get("measure", claims.late), kind)
-
-
-def test_the_verdict_follows_from_the_interval_of_the_difference() -> None:
-    rng = np.random.default_rng(1)
-    good, bad = rng.normal(1.0, 0.5, 10), rng.normal(0.0, 0.5, 10)
-    rows = [*rows_with("A", good.tolist()), *rows_with("B", bad.tolist())]
-    found = assess(claim_of("A", "B"), rows)
-    assert found is not None
-    assert found["effect"] == pytest.approx(good.mean() - bad.mean(), abs=1e-4)
-    # the percentile bootstrap of a difference of means is close to the normal interval
-    width = 1.96 * np.sqrt(good.var() / 10 + bad.var() / 10)
-    assert found["high"] - found["low"] == pytest.approx(2 * width, rel=0.1)
-    assert found["verdict"] == "confirmed"
-    against = assess(claim_of("B", "A"), rows)
-    assert against is not None
-    assert against["verdict"] == "contradicted"
-    as_good = assess(claim_of("B", "A", Kind.AS_GOOD), rows)  # within the margin of 4
-    assert as_good is not None
-    assert as_good["verdict"] == "confirmed"
-    assert assess(claim_of("A", "C"), rows) is None
-
-
-def test_a_claim_about_a_single_curve() -> None:
-    rows = rows_with("A", [1.0, 2.0, 5.0, 3.0, 7.0, 4.0])
-    gains = assess(claim_of("A", None, measure=claims.later_gain), rows)
-    assert gains is not None
-    assert gains["effect"] == pytest.approx(0.001 * (13.0 - 7.0), abs=1e-4)
-    assert gains["comparison"] == "A"
-
-
-def test_curves_are_compared_over_their_common_iterations() -> None:
-    long = rows_with("A", [0.0] * 6, iterations=20)
-    short = rows_with("B", [0.0] * 6, iterations=15)
-    found = assess(claim_of("A", "B"), [*long, *short])
-    assert found is not None
-    assert found["iterations"] == 15
-    assert found["effect"] == 0.0
-    once = assess(claim_of("A", "B"), [*long, *rows_with("B", [0.0] * 6, iterations=1)])
-    assert once is not None
-    assert once["iterations"] == 20  # one iteration is all that the other needs
-
-
-@pytest.mark.parametrize(
-    ("seeds", "iterations", "reason"),
-    [
-        (1, 20, "too few seeds: 1, at least 6"),
-        (2, 3, "too few seeds: 2, at least 6"),
-        (5, 20, "too few seeds: 5, at least 6"),
-        (6, 1, "too few iterations: 1, at least 14"),
-        (6, 3, "too few iterations: 3, at least 14"),
-        (6, 13, "too few iterations: 13, at least 14"),
-    ],
-)
-@pytest.mark.parametrize("worse", ["B", None])
-@pytest.mark.filterwarnings("error")
-def test_too_few_seeds_or_iterations_get_no_verdict(
-    seeds: int, iterations: int, reason: str, worse: str | None
-) -> None:
-    rows = rows_with("A", [1.0] * seeds, iterations=iterations)
-    rows += rows_with("B", [0.0] * 10, iterations=iterations)
-    for measure in (claims.early, claims.late, claims.later_gain, claims.steadiness):
-        found = assess(claim_of("A", worse, measure=measure), rows)
-        assert found is not None
-        assert found["verdict"] == reason
-        assert found["effect"] is found["low"] is found["high"] is None
-        row = claims.claims_table([found]).splitlines()[2]
-        assert f"| – | – | better | **{reason}** |" in row and "nan" not in row
-
-
-@pytest.mark.filterwarnings("error")
-def test_seeds_that_are_all_equal_have_an_interval_without_a_warning() -> None:
-    found = assess(claim_of("A", "B"), [*rows_with("A", [1.0] * 6), *rows_with("B", [0.0] * 6)])
-    assert found is not None
-    assert found["effect"] == found["low"] == found["high"] == 1.0
-    assert found["verdict"] == "confirmed"
-
-
-@pytest.mark.parametrize(
-    ("low", "high", "kind", "found"),
-    [
-        (0.1, 1.0, Kind.BETTER, "confirmed"),
-        (-1.0, -0.1, Kind.BETTER, "contradicted"),
-        (-0.1, 0.1, Kind.BETTER, "not separated"),
-        (-0.1, 0.1, Kind.AS_GOOD, "confirmed"),
-        (5.0, 6.0, Kind.AS_GOOD, "confirmed"),
-        (-0.3, 0.1, Kind.AS_GOOD, "not separated"),
-        (-0.5, -0.3, Kind.AS_GOOD, "contradicted"),
-        (-0.1, 0.1, Kind.EQUAL, "confirmed"),
-        (0.3, 0.5, Kind.EQUAL, "contradicted"),
-        (-0.1, 0.5, Kind.EQUAL, "not separated"),
-    ],
-)
-def test_verdicts(low: float, high: float, kind: Kind, found: str) -> None:
-    assert verdict(low, high, kind, 0.2) == found
-
-
-def test_measures() -> None:
-    rows = [{"stochastic": str(v), "greedy": str(v + 1)} for v in (0, 1, 2, 3, 9, 5, 7, 6, 8, 8)]
-    assert claims.early(rows) == 1.5
-    assert claims.late(rows) == pytest.approx((5 + 7 + 6 + 8 + 8) / 5)
-    assert claims.late_greedy(rows) == pytest.approx(claims.late(rows) + 1)
-    assert claims.later_gain(rows) == pytest.approx(claims.late(rows) - (9 + 5 + 7 + 6 + 8) / 5)
-    assert claims.steadiness(rows) == pytest.approx(-1.0 / 4)
-    assert claims.whole(rows) == pytest.approx(4.9)
-
-
-def test_claims_name_curves_that_their_figures_show() -> None:
-    for claim in CLAIMS:
-        curves = FIGURES[claim.figure]
-        several = len({task for task, _ in curves}) > 1
-        shown = {f"{method}, {task}" if several else method for task, method in curves}
-        assert {claim.better, claim.worse} <= {*shown, None}
-
-
-def test_claims_are_written_from_result_files(tmp_path: Path) -> None:
-    assert write_claims(tmp_path) == []
-    better, worse = [-0.2, -0.3, -0.25, -0.2, -0.3, -0.25], [-0.5, -0.4, -0.5, -0.4, -0.5, -0.4]
-    rows = [*rows_with("kernel REPS", better), *rows_with("NPALP", worse)]
-    with open(tmp_path / "figure-1a.csv", "w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        writer.writeheader()
-        writer.writerows(rows)
-    assert [path.name for path in write_claims(tmp_path)] == ["claims.json", "claims.md"]
-    found = json.loads((tmp_path / "claims.json").read_text())
-    assert {"kernel REPS - NPALP", "NPALP - kernel REPS"} <= {c["comparison"] for c in found}
-    assert "**confirmed**" in (tmp_path / "claims.md").read_text()
-    (tmp_path / "figure-1a.csv").write_text("other,columns\n1,2\n")
-    with pytest.raises(StorageError, match="figure-1a"):
-        write_claims(tmp_path)
-
-
 # ---- executors --------------------------------------------------------------------------------
 
 
@@ -397,6 +242,8 @@ def results_of(values: dict[str, list[float]]) -> list[dict[str, Any]]:
         {
             "commit": "abc",
             "trial": {"task": "swing-up", "method": method, "options": {}},
+            "settings": {"ridge": 0.1},
+            "code": {"kreps.seeding:generator": f"hash of {method}"},
             "rows": [
                 {
                     "task": "swing-up",
@@ -436,6 +283,8 @@ def test_result_files_hold_all_rows_and_their_provenance(tmp_path: Path) -> None
     content = json.loads((tmp_path / "try.json").read_text())
     assert content["summary"] == json.loads(json.dumps(summary))
     assert (content["command"], content["commit"]) == ("kreps reproduce try", "abc, def")
+    assert content["settings"] == {"swing-up: A": {"ridge": 0.1}}
+    assert content["code"] == {"kreps.seeding:generator": "hash of A"}
     assert commits_of(results) == "abc, def"
     with open(tmp_path / "try.csv", newline="") as file:
         rows = list(csv.DictReader(file))

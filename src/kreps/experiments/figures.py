@@ -18,7 +18,7 @@ from kreps.envs.swing_up import TIME_STEP
 from kreps.errors import StorageError
 from kreps.experiments.specs import METHODS, TASKS
 from kreps.experiments.tables import markdown
-from kreps.experiments.trials import commits_of
+from kreps.experiments.trials import code_of, commits_of
 from kreps.learning.collect import simulate
 from kreps.learning.control_period import control_period
 from kreps.learning.environment import opened, task_of
@@ -100,8 +100,12 @@ def write_results(
         "command": command,
         "commit": commits_of(results),
         "options": {f"{t['task']}: {t['method']}": t["options"] for t in trials},
+        "settings": {
+            f"{r['trial']['task']}: {r['trial']['method']}": r["settings"] for r in results
+        },
         "versions": versions(),
         "summary": summary,
+        "code": code_of(results),
     }
     write_atomically(folder / f"{name}.json", (json.dumps(content, indent=2) + "\n").encode())
     write_atomically(folder / f"{name}.md", (markdown_table(summary) + "\n").encode())
@@ -219,6 +223,7 @@ TITLES = {
     "untuned": "KREPS(env) without further arguments: all seeds",
     "ablation": "The default with one part replaced: all seeds",
     "low-rank": "Exact and low-rank updates: all seeds",
+    "golden": "Trials that the tests run again",
     "forgetting": "Swing-up with and without a replay window of 30 rollouts",
 }
 SEED_BY_SEED = ("swing-up", "untuned", "ablation", "low-rank")

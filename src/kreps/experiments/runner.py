@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
 from typing import Any
@@ -18,10 +18,18 @@ from rich.progress import (
 from rich.table import Column
 
 from kreps.errors import TrialFailure
+from kreps.experiments.fingerprint import changes
 from kreps.experiments.provenance import commit
 from kreps.experiments.search import tuned_options
 from kreps.experiments.specs import EXTRA_EXPERIMENTS, FIGURES, FIRST_SEED, TASKS
-from kreps.experiments.trials import Trial, read_trial, run_trial, trial_of, write_trial
+from kreps.experiments.trials import (
+    Trial,
+    read_trial,
+    run_recorded,
+    run_trial,
+    trial_of,
+    write_trial,
+)
 from kreps.learning.evaluate import EPISODES
 
 Result = dict[str, Any]
@@ -62,6 +70,9 @@ class _ResultFolder:
         for trial in self.trials:
             if (result := read_trial(trial, folder)) is not None:
                 self.results[trial.name] = result
+        self._drop_stale()
+        self.recorded = {t.curve for t in self.trials if self._code(t)}
+        """Curves with a fingerprint: the first trial that runs of each other one makes it."""
         self.missing: dict[str, list[Trial]] = {}
         """Trials without a result, by their work."""
         for trial in self.trials:
@@ -71,6 +82,25 @@ class _ResultFolder:
         self.display = bar.add_task(
             "trials", total=self.count, completed=len(self.results), last=""
         )
+
+    def _code(self, trial: Trial) -> dict[str, str]:
+        code: dict[str, str] = self.results.get(trial.name, {}).get("code", {})
+        return code
+
+    def _drop_stale(self) -> None:
+        """Forget the results of curves whose code has changed since, so that they are run again."""
+        stale = {t.curve for t in self.trials if changes(self._code(t))}
+        for task, method, _ in stale:
+            self.bar.console.print(f"{task}, {method}: its code has changed, so it runs again")
+        for trial in self.trials:
+            if trial.curve in stale:
+                self.results.pop(trial.name, None)
+
+    def function(self, work: str) -> Callable[[Trial], Result]:
+        """What runs a work: the first one of a curve is recorded."""
+        new = {trial.curve for trial in self.missing[work]} - self.recorded
+        self.recorded |= new
+        return run_recorded if new else run_trial
 
     def keep(self, work: str, result: Mapping[str, Any]) -> None:
         """Write the result of all trials with this work."""
@@ -131,7 +161,9 @@ def _run_missing(kept: _ResultFolder, executor: Executor) -> dict[str, Exception
     """Run what is missing; the errors of trials that failed, by the name of the trial."""
     source = commit()  # now: the source tree may change while the trials run
     failures: dict[str, Exception] = {}
-    running = {executor.submit(run_trial, same[0]): work for work, same in kept.missing.items()}
+    running = {
+        executor.submit(kept.function(work), same[0]): work for work, same in kept.missing.items()
+    }
     try:
         for future in as_completed(running):
             work = running[future]

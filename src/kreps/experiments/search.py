@@ -21,7 +21,7 @@ import numpy as np
 from kreps.errors import StorageError
 from kreps.experiments.specs import FEATURES, GRID_VI, KERNEL, METHODS, NPALP, SAMPLE, VALUES
 from kreps.experiments.tables import markdown
-from kreps.experiments.trials import Trial, commits_of, name_of, trial_of
+from kreps.experiments.trials import Trial, code_of, commits_of, name_of, trial_of
 from kreps.learning.storage import write_atomically
 
 SEEDS = (200, 201)
@@ -168,6 +168,7 @@ def write_search(
         "score": "evaluated reward, half with exploration and half without, "
         f"mean of the last {COUNTED} iterations",
         "outcome": found,
+        "code": code_of(results),
     }
     write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
     write_atomically(path.with_suffix(".md"), (search_table(content) + "\n").encode())

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from kreps.errors import StorageError
+from kreps.experiments.fingerprint import Fingerprint, recorded
 from kreps.experiments.specs import METHODS, TASKS
 from kreps.kernels.threads import blas_threads
 from kreps.learning.environment import opened
@@ -19,6 +20,7 @@ from kreps.learning.learner import Learner
 from kreps.learning.methods import LEARNERS
 from kreps.learning.progress import seconds_by_stage
 from kreps.learning.storage import write_atomically
+from kreps.presets import flat
 from kreps.settings import OnPolicySettings
 
 
@@ -56,6 +58,11 @@ class Trial:
         """All fields in the form that a JSON file returns them in."""
         plain: dict[str, Any] = json.loads(json.dumps({**vars(self), "options": {**self.options}}))
         return plain
+
+    @property
+    def curve(self) -> tuple[str, str, str]:
+        """What the trials of different seeds have in common."""
+        return self.task, self.method, self.label
 
     @property
     def work(self) -> str:
@@ -110,11 +117,19 @@ def trial_of(
     )
 
 
+def run_recorded(trial: Trial) -> dict[str, Any]:
+    """`run_trial` with the fingerprint of the code that it called as ``code``."""
+    with recorded() as code:
+        result = run_trial(trial)
+    return {**result, "code": code}
+
+
 def run_trial(trial: Trial) -> dict[str, Any]:
     """Learn; after every iteration evaluate the policy on random numbers of its own.
 
     Returns:
-        ``trial``: its description; ``rows``: one per iteration.
+        ``trial``: its description; ``settings``: their values, with all defaults; ``code``: empty;
+        ``rows``: one per iteration.
     """
     rows: list[dict[str, Any]] = []
 
@@ -149,11 +164,27 @@ def run_trial(trial: Trial) -> dict[str, Any]:
     with opened(trial.environment) as env:
         learner = LEARNERS[trial.learner](env, seed=trial.seed, **trial.options)
         learner.learn(trial.iterations, callback=add_row, progress=False)
-    return {"trial": trial.description(), "rows": rows}
+    settings = settings_of_trial(trial)
+    return {"trial": trial.description(), "settings": settings, "code": {}, "rows": rows}
+
+
+def settings_of_trial(trial: Trial) -> dict[str, Any]:
+    """What decides the result of a trial besides the code, the seed and the iterations."""
+    with opened(trial.environment) as env:
+        learner = LEARNERS[trial.learner](env, **trial.options)
+    values = {
+        "environment": trial.environment,
+        "learner": trial.learner,
+        "episodes": trial.episodes,
+        **flat(learner.settings),
+    }
+    plain: dict[str, Any] = json.loads(json.dumps(values))
+    return plain
 
 
 def read_trial(trial: Trial, folder: Path) -> dict[str, Any] | None:
-    """The result in the folder; None if there is none, or one of other settings or iterations.
+    """The result in the folder; None if there is none, or one of other settings or iterations,
+    or of before results had a fingerprint.
 
     Raises:
         StorageError: the file is damaged.
@@ -161,7 +192,7 @@ def read_trial(trial: Trial, folder: Path) -> dict[str, Any] | None:
     path = folder / f"{trial.name}.json"
     try:
         result = json.loads(path.read_text())
-        same = result["trial"] == trial.description()
+        same = result["trial"] == trial.description() and "code" in result
         complete = len(result["rows"]) == trial.iterations and isinstance(result["commit"], str)
         return result if same and complete else None
     except FileNotFoundError:
@@ -189,6 +220,11 @@ def write_trial(trial: Trial, folder: Path, result: dict[str, Any]) -> None:
 def name_of(result: Mapping[str, Any]) -> str:
     """The name of the trial that a result belongs to."""
     return Trial(**result["trial"]).name
+
+
+def code_of(results: Sequence[Mapping[str, Any]]) -> Fingerprint:
+    """The fingerprints of all trials in one."""
+    return dict(sorted({k: v for result in results for k, v in result["code"].items()}.items()))
 
 
 def commits_of(results: Sequence[Mapping[str, Any]]) -> str:
