@@ -33,6 +33,7 @@ from kreps.experiments.trials import (
     commits_of,
     name_of,
     read_trial,
+    run_recorded,
     run_trial,
     trial_of,
     write_trial,
@@ -123,6 +124,39 @@ def test_trials_with_a_result_are_not_run_again(tmp_path: Path) -> None:
     idle = Inline()
     assert run_trials(trials, idle, tmp_path) == results
     assert idle.calls == 0
+
+
+class Canned(Executor):
+    """Returns a result at once, and notes the seed and the function of each trial."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[int, str]] = []
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        (trial,) = args
+        self.calls.append((trial.seed, fn.__name__))
+        code = {"kreps.seeding:no_such_function": "0"} if fn is run_recorded else {}
+        future: Future[Any] = Future()
+        rows = [{"task": "", "method": ""}] * trial.iterations
+        future.set_result({"trial": trial.description(), "code": code, "rows": rows})
+        return future
+
+
+def test_trials_of_a_curve_run_again_if_its_code_has_changed(tmp_path: Path) -> None:
+    trials = [tiny(seed) for seed in (0, 1)]
+    first = Canned()
+    run_trials(trials, first, tmp_path)
+    assert first.calls == [(0, "run_recorded"), (1, "run_trial")]
+    again = Canned()
+    run_trials(trials, again, tmp_path)  # "no_such_function" is gone
+    assert again.calls == first.calls
+    for trial in trials:
+        result = read_trial(trial, tmp_path)
+        assert result is not None
+        write_trial(trial, tmp_path, {**result, "code": {}})
+    unchanged = Canned()
+    run_trials(trials, unchanged, tmp_path)
+    assert unchanged.calls == []
 
 
 def test_results_of_other_settings_are_ignored_and_damaged_ones_raise(tmp_path: Path) -> None:
