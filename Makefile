@@ -12,11 +12,12 @@ demo: .venv/installed           ## learn the swing-up; writes pictures and polic
 test: .venv/installed           ## all tests
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
-check: .venv/installed          ## formatter, linter, types, import contracts
+check: .venv/installed          ## formatter, linter, types, import contracts, stale results
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python docs/stale_results.py
 
 bench: .venv/installed          ## benchmarks of speed; writes results/benchmarks.md
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest benchmarks --record=results
