@@ -28,7 +28,10 @@ def filled(text: str, results: Path = ROOT / "results") -> str:
         content = path.read_text().strip() + "\n" if path.exists() else ""
         command = stale.get(match[2].removesuffix("-steps"))
         if content and command:
-            content += f"\n*Stale: the present code or settings may give other numbers. To renew: `{command}`.*\n"
+            content += (
+                "\n*Stale: the present code or settings may give other numbers.\n"
+                f"To renew: `{command}`.*\n"
+            )
         return match[1] + content + match[4]
 
     return SHOWN.sub(table, text)

@@ -91,13 +91,18 @@ def names_of(results: Path = RESULTS) -> list[str]:
     return sorted({*names, "search"})
 
 
+def table(stale: dict[str, str]) -> str:
+    """The documentation's table of stale results, from their commands."""
+    rows = [(name, f"`{command}`") for name, command in stale.items()]
+    return markdown(("stale result", "to renew"), rows)
+
+
 def main() -> int:
     found = {name: reasons(name) for name in names_of()}
     stale = {name: RENEWAL[name] for name, why in found.items() if why}
     if "--declare" in sys.argv[1:]:
         (RESULTS / "stale.json").write_text(json.dumps(stale, indent=1) + "\n")
-        rows = [(name, f"`{command}`") for name, command in stale.items()]
-        (RESULTS / "stale.md").write_text(markdown(("stale result", "to renew"), rows) + "\n")
+        (RESULTS / "stale.md").write_text(table(stale) + "\n")
         return 0
     declared = json.loads((RESULTS / "stale.json").read_text())
     for name in sorted(stale.keys() - declared.keys()):

@@ -17,10 +17,12 @@ from kreps.experiments.verdicts import claims_table, write_claims
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "benchmarks")]
+import coverage  # noqa: E402
 import delays  # noqa: E402
 import peers_seconds  # noqa: E402
 import peers_table  # noqa: E402
 import robot_time  # noqa: E402
+import stale_results  # noqa: E402
 import suite  # noqa: E402
 from fill_tables import filled  # noqa: E402
 
@@ -92,6 +94,11 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
             assert table == claims_table(content)
         elif name == "search":
             assert table == search_table(content)
+        elif name == "stale":
+            assert table == stale_results.table(content)
+        elif name == "coverage":
+            assert table == coverage.table(content["rows"])
+            assert "+" not in content["commit"]
         elif name == "delays":
             assert table == delays.table(content["results"]).strip()
             assert "+" not in content["commit"]

@@ -148,7 +148,11 @@ def test_pages_say_which_of_their_tables_are_stale(tmp_path: Path) -> None:
     page = "<!-- results: one-steps -->\n<!-- end of results -->"
     assert "Stale" not in filled(page, tmp_path)
     (tmp_path / "stale.json").write_text('{"one": "kreps reproduce one"}')
-    assert "*Stale: the present code or settings may give other numbers. To renew: `kreps reproduce one`.*" in filled(page, tmp_path)
+    note = (
+        "*Stale: the present code or settings may give other numbers.\n"
+        "To renew: `kreps reproduce one`.*"
+    )
+    assert note in filled(page, tmp_path)
     assert filled(filled(page, tmp_path), tmp_path) == filled(page, tmp_path)
 
 
