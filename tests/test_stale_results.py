@@ -38,6 +38,7 @@ def limited(x: float) -> float:
     ("old", "new", "same"),
     [
         ("The number", "A number", True),
+        ('    """The number, or the limit."""\n', "", True),
         ("return min", "# a comment\n    return min", True),
         ("x: float", "x: int", True),
         ("negative", "x is below 0", True),

@@ -38,6 +38,10 @@ NOT_RESULTS = (
 """Modules of settings, which results hold by value, of messages and of files."""
 
 
+PROVENANCE = {f"kreps.experiments.{name}" for name in ("fingerprint", "provenance", "source")}
+"""Modules that scripts import to describe their results."""
+
+
 @contextmanager
 def recorded() -> Iterator[Fingerprint]:
     """A fingerprint that holds, after the context, all functions of kreps that ran inside it.
@@ -86,7 +90,7 @@ def script_fingerprint(path: Path) -> Fingerprint:
     """
     root = path.resolve().parents[1]
     found = {str(path.resolve().relative_to(root)): hash_of_file(path)}
-    for module in sorted(reachable(imports_of_file(path))):
+    for module in sorted(reachable(imports_of_file(path)) - PROVENANCE):
         found[module] = str(hash_of(module))
     return found
 

@@ -36,9 +36,9 @@ class Source:
 class _Bare(ast.NodeTransformer):
     """Removes what no result depends on."""
 
-    def visit_Expr(self, node: ast.Expr) -> ast.AST:
+    def visit_Expr(self, node: ast.Expr) -> ast.AST | None:
         text = isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
-        return ast.Pass() if text else self.generic_visit(node)
+        return None if text else self.generic_visit(node)
 
     def visit_arg(self, node: ast.arg) -> ast.AST:
         return ast.arg(node.arg)
@@ -121,7 +121,8 @@ def hash_of(name: str) -> str | None:
 
 
 def _hash(node: ast.AST) -> str:
-    return hashlib.sha256(ast.dump(node).encode()).hexdigest()[:12]
+    text = ast.unparse(node)  # ast.dump differs between versions of Python
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def hash_of_file(path: Path) -> str:
