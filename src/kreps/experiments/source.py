@@ -121,8 +121,19 @@ def hash_of(name: str) -> str | None:
 
 
 def _hash(node: ast.AST) -> str:
-    text = ast.unparse(node)  # ast.dump differs between versions of Python
-    return hashlib.sha256(text.encode()).hexdigest()[:12]
+    return hashlib.sha256(repr(_plain(node)).encode()).hexdigest()[:12]
+
+
+def _plain(value: object) -> object:
+    """The tree as tuples without empty fields, in which versions of Python differ."""
+    if isinstance(value, list):
+        return tuple(map(_plain, value))
+    if not isinstance(value, ast.AST):
+        return value
+    fields = [
+        (name, _plain(each)) for name, each in ast.iter_fields(value) if each not in (None, [])
+    ]
+    return type(value).__name__, *fields
 
 
 def hash_of_file(path: Path) -> str:
