@@ -115,8 +115,8 @@ def left_out(recording: Recording) -> Iterator[Finding]:
         remedy = "next_observations, or one more row per episode, without an action."
         yield Finding("terminal observations", "limit", len(ends), 0.0, sentence, remedy)
     if not (missing or len(gaps) or len(backwards)):
-        used, rows = len(np.unique(recording.rows)), len(recording.table)
-        sentence = f"No gap and no missing value; {used} of {rows} rows are in rollouts."
+        used, of = len(np.unique(recording.rows)), len(recording.table)
+        sentence = f"No gap and no missing value; {used} of {of} rows are in rollouts."
         yield Finding("missing values", "fine", 0.0, 0.0, sentence)
 
 

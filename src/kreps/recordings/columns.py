@@ -19,6 +19,9 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 ELEMENT = re.compile(r"(.+)\[(\d+)\]")
 """The name of one number of a column that has several per row."""
 
+MAX_WIDTH = 64
+"""Largest number of numbers per row of a column that is listed where none is named."""
+
 RewardFunction = Callable[[FloatArray, FloatArray, FloatArray], FloatArray]
 """Rewards (n,) of states (n, ds), actions (n, da) and successors (n, ds)."""
 
@@ -109,14 +112,15 @@ class Columns(Checked):
         listed = (*self.observations, *self.actions, *self.next_observations)
         return (*listed, *(name for name in single if name is not None))
 
-    def needs(self, name: str) -> bool:
+    def needs(self, name: str, width: int = 1) -> bool:
         """Whether a column is named, as a whole or by an element, or has a common name.
 
-        Without any name every column is needed.
+        Without any name every column is needed, of up to `MAX_WIDTH` numbers per row.
         """
         named = {*self.names, *(name for names in COMMON_NAMES.values() for name in names)}
         elements = (element[1] for element in map(ELEMENT.fullmatch, named) if element)
-        return not self.names or name in named or name in elements
+        listed = not self.names and width <= MAX_WIDTH
+        return listed or name in named or name in elements
 
     def completed(self, present: Collection[str]) -> Columns:
         """With the `COMMON_NAMES` among the columns that are present, where none are given."""

@@ -77,6 +77,18 @@ class Table:
             all(part.episodes for part in parts),
         )
 
+    @classmethod
+    def of_episodes(cls, parts: Sequence[Table]) -> Table:
+        """A table of which each part is a whole episode.
+
+        Raises:
+            DataError: there is none, or as `concat`.
+        """
+        if not parts:
+            raise DataError("it has no episode; check that the recording was closed")
+        joined = cls.concat(parts)
+        return cls(joined.columns, joined.starts, joined.names, episodes=True)
+
     def __len__(self) -> int:
         """Number of rows N."""
         return len(next(iter(self.columns.values()), ()))
@@ -195,3 +207,25 @@ def _number(value: Any) -> float | None:
         return float(value)
     except (TypeError, ValueError):
         return None
+
+
+def episode_table(arrays: Mapping[str, NDArray[Any]], name: str) -> Table:
+    """The table of an episode, with a missing last row where a column has one row less.
+
+    Observations may have a row more than actions and rewards, for the last observation.
+
+    Raises:
+        DataError: columns of other lengths.
+    """
+    rows = max((len(values) for values in arrays.values()), default=0)
+    columns = {}
+    for column, values in arrays.items():
+        if rows - len(values) not in (0, 1):
+            raise DataError(
+                f"column {column} of {name} has {len(values)} rows and another one {rows}; of an "
+                "episode, observations may have one row more than the others"
+            )
+        missing: Any = np.nan if values.dtype.kind in "biuf" else None
+        last = np.full((rows - len(values), *values.shape[1:]), missing)
+        columns[column] = np.concatenate([values, last]) if len(last) else values
+    return Table.from_columns(columns, name)

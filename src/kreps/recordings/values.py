@@ -67,13 +67,13 @@ class Values:
     @property
     def is_point(self) -> BoolArray:
         """(N,) whether observation and time stamp are there."""
-        found: BoolArray = is_sane(self.observations).all(axis=1)
+        found: BoolArray = np.asarray(is_sane(self.observations).all(axis=1))
         return found if self.times is None else found & is_sane(self.times)
 
     @property
     def is_chosen(self) -> BoolArray:
         """(N,) whether the action is there."""
-        found: BoolArray = is_sane(self.actions).all(axis=1)
+        found: BoolArray = np.asarray(is_sane(self.actions).all(axis=1))
         return found
 
     @property

@@ -24,10 +24,15 @@ def read(path: Path, columns: Columns) -> Table:
     """
     with warnings.catch_warnings():
         warnings.simplefilter("error", pd.errors.ParserWarning)  # of values without a column
-        frame = pd.read_csv(path, sep=_delimiter(path), index_col=False, skipinitialspace=True)
+        frame = pd.read_csv(
+            path,
+            sep=_delimiter(path),
+            index_col=False,
+            skipinitialspace=True,
+        )
     frame.columns = [str(name).strip() for name in frame.columns]
     if columns.time in frame and not pd.api.types.is_numeric_dtype(frame[columns.time]):
-        frame[columns.time] = pd.to_datetime(frame[columns.time])
+        frame[columns.time] = pd.to_datetime(frame[columns.time], format="ISO8601")
     return Table.from_columns({name: _array(frame[name]) for name in frame.columns}, path.name)
 
 
