@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -228,3 +229,24 @@ def test_a_first_policy_is_learnt_from_recorded_data_alone(
     more = ["train", "--data", data, "--spec", spec, "--iterations", "3", "--out", tmp_path / "x"]
     assert "recorded data give one update" in rejected(*more)
     assert not (tmp_path / "x").exists()
+
+
+def test_the_page_about_recorded_data_does_what_it_says(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pd = pytest.importorskip("pandas")
+    monkeypatch.chdir(tmp_path)
+    pd.DataFrame(columns_of(pushes(2))).to_csv("recording.csv", index=False)
+    page = (Path(__file__).resolve().parents[1] / "docs/recorded_data.md").read_text()
+    blocks = re.findall(r"^```(\w*)\n(.*?)^```", page, re.M | re.S)
+    (script,) = [text for language, text in blocks if language == "python"]
+    (spec,) = [text for language, text in blocks if language == "toml"]
+    Path("robot.toml").write_text(spec)
+    exec(compile(script, "recorded_data.md", "exec"), {})
+    assert "of 120 recorded steps are effective samples" in capsys.readouterr().out
+    commands = [line for language, text in blocks if not language for line in text.splitlines()]
+    imports = [line.split()[1:] for line in commands if line.startswith("kreps import rec")]
+    assert len(imports) == 2
+    for arguments in imports:
+        assert call(*arguments)[0] == 0
+    assert len(kreps.load_rollouts("rollouts.safetensors")) == 2
