@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -170,16 +169,11 @@ def test_extrapolation_is_none_of_the_recorded_controller_and_grows_with_the_dis
 
 @pytest.fixture
 def files(tmp_path: Path) -> tuple[Path, Path]:
-    """A recording and its spec, in whatever format can be written here."""
-    h5py = pytest.importorskip("h5py")
-    with h5py.File(tmp_path / "pushes.h5", "w") as file:
-        for name, values in columns_of(pushes(6)).items():
-            file[name] = values
-    names = {name: json.dumps(value) for name, value in NAMES.items()}
-    text = "[columns]\n" + "\n".join(f"{name} = {value}" for name, value in names.items())
+    """Rollouts as ``kreps import`` writes them, and their spec."""
+    kreps.save_rollouts(pushes(6), tmp_path / "pushes.safetensors")
     spec = tmp_path / "robot.toml"
-    spec.write_text(f"{text}\n[task]\naction_low = [-1.0]\naction_high = [1.0]\n")
-    return tmp_path / "pushes.h5", spec
+    spec.write_text("[task]\naction_low = [-1.0]\naction_high = [1.0]\n")
+    return tmp_path / "pushes.safetensors", spec
 
 
 def test_import_reports_and_writes_rollouts(files: tuple[Path, Path], tmp_path: Path) -> None:
@@ -190,16 +184,16 @@ def test_import_reports_and_writes_rollouts(files: tuple[Path, Path], tmp_path: 
     assert "366 rows; 6 rollouts of 360 steps, 0 of them terminated; 2 observation coord" in text
     assert "Fine: sampling. The control period is 0.05 s" in text
     np.testing.assert_array_equal(kreps.load_rollouts(out).points, pushes(6).points)
-    code, text = call("import", data, *flags(NAMES))
+    first = ["--column", "observations=observations[1],observations[0]"]
+    code, text = call("import", data, *first, "--column", "reward=rewards")
     assert code == 0 and "Give the action limits in [task]" in text
-    assert "angle: -" in rejected("import", data)  # the columns are listed
+    assert "2 observation coordinates (observations[1], observations[0])" in text
+    code, text = call("import", data)
+    assert code == 0 and "observations x 2: -" in text  # the columns are listed
+    wrong = ["--column", "observations=angle"]
+    assert "no column 'angle'; there are observations, " in rejected("import", data, *wrong)
     assert "ends in .safetensors" in rejected("import", data, "--out", tmp_path / "r.csv")
     assert "is not NAME=COLUMN" in rejected("import", data, "--column", "angle")
-
-
-def flags(names: dict[str, Any]) -> list[str]:
-    given = {n: ",".join(v) if isinstance(v, list) else v for n, v in names.items()}
-    return [part for name, text in given.items() for part in ("--column", f"{name}={text}")]
 
 
 def test_a_first_policy_is_learnt_from_recorded_data_alone(

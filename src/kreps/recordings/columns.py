@@ -126,8 +126,9 @@ class Columns(Checked):
         """With the `COMMON_NAMES` among the columns that are present, where none are given."""
         found: dict[str, Any] = {}
         for field, names in COMMON_NAMES.items():
-            if field == "reward" and self.reward_function is not None:
-                continue
+            computed = field == "reward" and self.reward_function is not None
+            if computed or (field == "next_observations" and self.observations):
+                continue  # what is named may be other numbers than those of the common name
             name = next((name for name in names if name in present), None)
             if name is not None and not getattr(self, field):
                 found[field] = (name,) if field in LISTS else name

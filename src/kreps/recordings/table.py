@@ -188,15 +188,16 @@ class Table:
 
     def seconds(self, name: str, unit: str) -> FloatArray:
         """A column of time stamps (N,) in s after the first one; missing ones are NaN."""
-        values = self.column(name)
+        values = self.column(name).reshape(len(self), -1)[:, 0]
         if values.dtype.kind == "M":
             stamps = values.astype("datetime64[ns]")
             known = stamps[~np.isnat(stamps)]
-            return (stamps - known.min(initial=stamps[0])) / np.timedelta64(1, "s")
+            first = known.min() if len(known) else np.datetime64("NaT")
+            return (stamps - first) / np.timedelta64(1, "s")
         if values.dtype.kind in "iu":  # before rounding: nanoseconds since 1970 have 19 digits
             return (values - values.min()).astype(np.float64) * SECONDS[unit]
-        stamps = self.numbers(name).reshape(len(self), -1)[:, 0] * SECONDS[unit]
-        return stamps - np.nanmin(stamps, initial=np.inf) if np.isfinite(stamps).any() else stamps
+        numbers = self.numbers(name).reshape(len(self), -1)[:, 0] * SECONDS[unit]
+        return numbers - np.nanmin(numbers) if np.isfinite(numbers).any() else numbers
 
 
 def _number(value: Any) -> float | None:

@@ -19,8 +19,9 @@ SUFFIXES: Mapping[str, tuple[str, ...]] = {
     "parquet": (".parquet", ".pq"),
     "hdf5": (".h5", ".hdf5"),
     "ros2": (".mcap", ".db3"),
+    "safetensors": (".safetensors",),
 }
-"""Names of files by format; each format is also the name of an extra of the package."""
+"""Names of files by format; each but the last is also the name of an extra of the package."""
 
 CONTENTS: Mapping[str, tuple[str, ...]] = {
     "lerobot": ("meta/info.json",),

@@ -31,8 +31,10 @@ def read(path: Path, columns: Columns) -> Table:
             skipinitialspace=True,
         )
     frame.columns = [str(name).strip() for name in frame.columns]
-    if columns.time in frame and not pd.api.types.is_numeric_dtype(frame[columns.time]):
-        frame[columns.time] = pd.to_datetime(frame[columns.time], format="ISO8601")
+    time = columns.completed(frame.columns).time
+    if time in frame and not pd.api.types.is_numeric_dtype(frame[time]):
+        dates = pd.to_datetime(frame[time], format="ISO8601", utc=True)
+        frame[time] = dates.dt.tz_localize(None)
     return Table.from_columns({name: _array(frame[name]) for name in frame.columns}, path.name)
 
 
