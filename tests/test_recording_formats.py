@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import sys
+import warnings
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -102,7 +103,8 @@ def minari(folder: Path, made: Rollouts, data_format: str = "hdf5") -> Written:
             **flags,
         }
         episodes.append(buffer(id=number, seed=None, options=None, infos={}, **given))
-    with pytest.MonkeyPatch.context() as patch, pytest.warns(UserWarning):
+    with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of an author and a link that are not given
         patch.setenv("MINARI_DATASETS_PATH", str(folder))
         minari.create_dataset_from_buffers(
             "swing/test-v0",
