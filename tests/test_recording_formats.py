@@ -39,10 +39,11 @@ def csv_of_a_spreadsheet(folder: Path, made: Rollouts) -> Written:
     pd = pytest.importorskip("pandas")
     frame = pd.DataFrame(columns_of(made))
     frame["t"] = pd.Timestamp("2026-01-01T10:00") + pd.to_timedelta(frame["t"], unit="s")
+    frame = frame.rename(columns={"t": "timestamp"})  # a common name
     text = frame.to_csv(index=False, sep=";").replace(";", " ; ")
     with gzip.open(folder / "r.csv.gz", "wt", encoding="utf-8-sig") as file:
         file.write(text)
-    return folder / "r.csv.gz", NAMES
+    return folder / "r.csv.gz", {n: column for n, column in NAMES.items() if n != "time"}
 
 
 def parquet(folder: Path, made: Rollouts) -> Written:
@@ -381,6 +382,20 @@ def test_lists_and_arrays_of_other_lengths_are_told(tmp_path: Path) -> None:
         file["o"], file["a"], file["r"] = np.zeros((5, 2)), np.zeros((3, 1)), np.zeros(5)
     with pytest.raises(DataError, match=r"column a of r.h5 has 3 rows and another one 5"):
         kreps.read_rollouts(tmp_path / "r.h5", columns)
+
+
+def test_numbered_groups_that_are_no_episodes_are_named_by_their_whole_paths(
+    tmp_path: Path,
+) -> None:
+    h5py = pytest.importorskip("h5py")
+    (made,) = rollouts((5,))
+    with h5py.File(tmp_path / "r.h5", "w") as file:
+        for number, position in enumerate(made.observations.T):
+            file[f"joint{number}/position"] = position
+        file["actions"], file["rewards"] = made.actions, made.rewards
+    columns = {"observations": ["joint0/position", "joint1/position"]}
+    found = kreps.read_rollouts(tmp_path / "r.h5", columns)
+    np.testing.assert_array_equal(found.points, made.observations)
 
 
 def test_a_dataset_of_lerobot_must_be_whole_and_of_a_known_version(tmp_path: Path) -> None:

@@ -112,15 +112,19 @@ class Columns(Checked):
         listed = (*self.observations, *self.actions, *self.next_observations)
         return (*listed, *(name for name in single if name is not None))
 
+    @property
+    def bases(self) -> set[str]:
+        """The names that are given, without the index of an element."""
+        elements = (element[1] for element in map(ELEMENT.fullmatch, self.names) if element)
+        return {*self.names, *elements}
+
     def needs(self, name: str, width: int = 1) -> bool:
         """Whether a column is named, as a whole or by an element, or has a common name.
 
         Without any name every column is needed, of up to `MAX_WIDTH` numbers per row.
         """
-        named = {*self.names, *(name for names in COMMON_NAMES.values() for name in names)}
-        elements = (element[1] for element in map(ELEMENT.fullmatch, named) if element)
-        listed = not self.names and width <= MAX_WIDTH
-        return listed or name in named or name in elements
+        common = any(name in names for names in COMMON_NAMES.values())
+        return common or name in self.bases or (not self.names and width <= MAX_WIDTH)
 
     def completed(self, present: Collection[str]) -> Columns:
         """With the `COMMON_NAMES` among the columns that are present, where none are given."""

@@ -19,7 +19,7 @@ Given = Columns | Mapping[str, Any] | str | Path | None
 
 
 def read_rollouts(path: Paths, columns: Given = None) -> Rollouts:
-    """Rollouts of a recording: CSV, Parquet, HDF5, Minari, LeRobot, or a ROS 2 bag.
+    """Rollouts of a recording: CSV, Parquet, HDF5, Minari, LeRobot, a ROS 2 bag, or kreps' own.
 
     Args:
         path: of a file or folder, or several of the same format, each of which begins a rollout.

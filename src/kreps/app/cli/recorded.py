@@ -34,13 +34,15 @@ IMPORT_EXAMPLES = (
 
 SpecOption = Annotated[
     Path | None,
-    typer.Option(help="TOML file with [columns] and [task]; docs/recorded_data.md has it.", **PATH),
+    typer.Option(
+        help="TOML file with the tables columns and task; docs/recorded_data.md has one.", **PATH
+    ),
 ]
 ColumnOption = Annotated[
     list[str],
     typer.Option(
         metavar="NAME=COLUMN",
-        help="A field of [columns]: observations, actions, reward, terminated, truncated, episode, "
+        help="A field of the columns: observations, actions, reward, terminated, truncated, episode, "
         "time and others; may be repeated, and lists are separated by commas.",
     ),
 ]
@@ -48,7 +50,7 @@ TaskOption = Annotated[
     list[str],
     typer.Option(
         metavar="NAME=VALUE",
-        help="A field of [task]: action_low, action_high, periodic, dt and others; may be "
+        help="A field of the task: action_low, action_high, periodic, dt and others; may be "
         "repeated.",
     ),
 ]

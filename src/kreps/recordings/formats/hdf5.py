@@ -23,14 +23,17 @@ def read(path: Path, columns: Columns) -> Table:
     """A file with data sets (N, ...) of an episode or more.
 
     Numbered groups, such as ``data/demo_0`` and ``episode_0``, are episodes, and the paths below
-    them are the names of the columns; data sets elsewhere are left out then.  Columns with one row
-    less than the others of an episode have none for its last observation.
+    them are the names of the columns; data sets elsewhere are left out then.  They are no episodes
+    if a column is named by its whole path.  Columns with one row less than the others of an episode
+    have none for its last observation.
     """
     with h5py.File(path) as file:
         flat: dict[str, NDArray[Any]] = {}
         groups: dict[tuple[str, int], dict[str, NDArray[Any]]] = defaultdict(dict)
-        for name, found in _datasets(file):
-            below = EPISODE.fullmatch(name)
+        datasets = dict(_datasets(file))
+        whole = not columns.bases.isdisjoint(datasets)
+        for name, found in datasets.items():
+            below = None if whole else EPISODE.fullmatch(name)
             column = below[3] if below else name
             if found.ndim and columns.needs(column, prod(found.shape[1:])):
                 into = groups[below[1], int(below[2])] if below else flat

@@ -20,7 +20,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from kreps.errors import ConfigurationError, DataError, StorageError
 from kreps.kernels.arrays import FloatArray
-from kreps.recordings.columns import ELEMENT, Columns
+from kreps.recordings.columns import Columns
 from kreps.recordings.table import Table
 
 HELD_PERIODS = 3.0
@@ -43,12 +43,11 @@ def read(path: Path, columns: Columns) -> Table:
         ConfigurationError: a topic that is named is not there.
         DataError: an array of a message changes its length.
     """
-    wanted = {element[1] if (element := ELEMENT.fullmatch(n)) else n for n in columns.names}
     store = get_typestore(Stores.LATEST)  # of messages whose definition the bag lacks
     topics: dict[str, _Topic] = {}
     with AnyReader([path], default_typestore=store) as reader:
         present = ", ".join(sorted({c.topic for c in reader.connections}))
-        chosen = [c for c in reader.connections if _is_wanted(c.topic, wanted, columns)]
+        chosen = [c for c in reader.connections if _is_wanted(c.topic, columns)]
         if not chosen:  # all would be read
             raise ConfigurationError(f"none of its topics is named; they are {present}")
         for connection, time, raw in reader.messages(connections=chosen):
@@ -76,9 +75,9 @@ def read(path: Path, columns: Columns) -> Table:
     return Table.from_columns(arrays, path.name)
 
 
-def _is_wanted(topic: str, wanted: set[str], columns: Columns) -> bool:
-    named = any(name.startswith(f"{topic}.") for name in wanted)
-    return named or topic == columns.clock or not wanted
+def _is_wanted(topic: str, columns: Columns) -> bool:
+    named = any(name.startswith(f"{topic}.") for name in columns.names)
+    return named or topic == columns.clock or not columns.names
 
 
 def _clock(columns: Columns, topics: Mapping[str, _Topic]) -> str:
