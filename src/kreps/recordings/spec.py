@@ -20,7 +20,6 @@ TASK_FIELDS = (
     "periodic",
     "dt",
     "time_limit",
-    "action_repeat",
     "delay",
     "history",
 )

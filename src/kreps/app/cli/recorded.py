@@ -42,8 +42,8 @@ ColumnOption = Annotated[
     list[str],
     typer.Option(
         metavar="NAME=COLUMN",
-        help="A field of the columns: observations, actions, reward, terminated, truncated, episode, "
-        "time and others; may be repeated, and lists are separated by commas.",
+        help="A field of the columns: observations, actions, reward, terminated, truncated, "
+        "episode, time and others; may be repeated, and lists are separated by commas.",
     ),
 ]
 TaskOption = Annotated[
