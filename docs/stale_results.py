@@ -42,6 +42,7 @@ RENEWAL = {
     "peers-seconds": "python benchmarks/peers_seconds.py",
     "predict": "python benchmarks/predict.py",
     "reaching-optimum": "python benchmarks/reaching_optimum.py",
+    "recorded-data": "python benchmarks/recorded_data.py",
     "search": "kreps search --workers 2",
     "suite": "python benchmarks/suite.py --seeds 20 21 22 --workers 2",
     "swing-up": "kreps reproduce swing-up --trials 10 --workers 2",

@@ -21,6 +21,7 @@ import coverage  # noqa: E402
 import delays  # noqa: E402
 import peers_seconds  # noqa: E402
 import peers_table  # noqa: E402
+import recorded_data  # noqa: E402
 import robot_time  # noqa: E402
 import stale_results  # noqa: E402
 import suite  # noqa: E402
@@ -101,6 +102,9 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
             assert "+" not in content["commit"]
         elif name == "delays":
             assert table == delays.table(content["results"]).strip()
+            assert "+" not in content["commit"]
+        elif name == "recorded-data":
+            assert table == recorded_data.table(content["rows"]).strip()
             assert "+" not in content["commit"]
         elif name == "suite":
             assert table == suite.table(content["results"])

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
         save_rollouts,
     )
     from kreps.presets import PRESETS
+    from kreps.recordings.columns import Columns
+    from kreps.recordings.reading import read_rollouts
     from kreps.settings import RKHS, Exploration, Grid, LowRank, ModelBased, Settings
 
 __all__ = [
@@ -45,6 +47,7 @@ __all__ = [
     "NPALP",
     "PRESETS",
     "RKHS",
+    "Columns",
     "Compute",
     "ConfigurationError",
     "DataError",
@@ -71,6 +74,7 @@ __all__ = [
     "check_file",
     "load_policy",
     "load_rollouts",
+    "read_rollouts",
     "rollout_folder",
     "save_rollouts",
 ]
@@ -101,6 +105,8 @@ _HOMES = {
     "load_rollouts": "learning.storage",
     "rollout_folder": "learning.storage",
     "save_rollouts": "learning.storage",
+    "Columns": "recordings.columns",
+    "read_rollouts": "recordings.reading",
     "Rollout": "data.rollouts",
     "Rollouts": "data.rollouts",
     "TaskSpec": "data.task",

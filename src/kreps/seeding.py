@@ -26,6 +26,7 @@ class Purpose(IntEnum):
     RESTART = 6
     BOOTSTRAP = 7
     PREDICTION = 8
+    EXTRAPOLATION = 9
 
 
 def _sequence(seed: int, purpose: Purpose, indices: tuple[int, ...]) -> np.random.SeedSequence:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 from kreps.app.run_folder import RunConfig
 from kreps.data.task import TaskSpec
 from kreps.envs.references import REFERENCE_RESTART_PROBABILITY, REFERENCE_REWARDS
+from kreps.errors import ConfigurationError
 from kreps.learning.environment import opened
 from kreps.learning.wrappers import Environment, Wrapper, keeps_actions, keeps_observations
 from kreps.learning.wrappers import metadata_of as usable_metadata
@@ -28,7 +29,15 @@ def environment_of(config: RunConfig, **options: Any) -> AbstractContextManager[
     Args:
         config: of the run.
         options: of ``gymnasium.make``, beside those of the run.
+
+    Raises:
+        ConfigurationError: the run is from recorded data.
     """
+    if not config.environment:
+        raise ConfigurationError(
+            "this run is from recorded data and has no environment, which is needed to evaluate, "
+            "to film or to go on; make one, and give it to kreps.KREPS.resume(CHECKPOINT, env)"
+        )
     return opened(config.environment, {**config.arguments, **options})
 
 

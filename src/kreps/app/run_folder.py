@@ -34,12 +34,13 @@ class RunConfig:
     """The configuration of a run, from which its environment and learner can be made again.
 
     Attributes:
-        environment: Gymnasium name.
+        environment: Gymnasium name; empty if the run is from recorded data.
         iterations: updates to make in total.
         seed, preset, settings: as given to `KREPS`; ``settings`` holds only what was changed, by
             flat names such as ``"value.max_rank"``.
         periodic: as given to `KREPS`.
         arguments: of the environment, as given to ``gymnasium.make``.
+        data: paths of the recordings, of a run from recorded data.
     """
 
     environment: str
@@ -49,6 +50,7 @@ class RunConfig:
     settings: dict[str, Any]
     periodic: list[int] | None
     arguments: dict[str, Any] = field(default_factory=dict)
+    data: list[str] = field(default_factory=list)
 
 
 class RunFolder:
@@ -104,6 +106,8 @@ class RunFolder:
     def write_config(self, config: RunConfig) -> None:
         """Write ``config.json``, with the versions of the software."""
         content = {**vars(config), "versions": versions()}
+        if not config.data:
+            del content["data"]
         write_atomically(self.config_file, (json.dumps(content, indent=2) + "\n").encode())
 
     def config(self) -> RunConfig:
@@ -121,6 +125,7 @@ class RunFolder:
                 content["preset"] = present_preset(recipe)
             config = RunConfig(**content)
             types = {"environment": str, "preset": str, "settings": dict, "arguments": dict}
+            types["data"] = list
             for name, kind in types.items():
                 if not isinstance(getattr(config, name), kind):
                     raise TypeError(f"{name} is not a {kind.__name__}")

@@ -219,6 +219,25 @@ class Learner(Generic[MethodSettings]):
                 break
         return self
 
+    def learn_from(self, rollouts: Iterable[Rollout], callback: Callback | None = None) -> Self:
+        """One update from recorded rollouts, as an iteration with a report for the callback.
+
+        Args:
+            rollouts: as for `update`.
+            callback: called with learner and report, as by `learn`.
+
+        Raises:
+            DataError: as `update`.
+        """
+        recorded = Rollouts.from_list(rollouts)
+        if not recorded:
+            raise DataError("there is no rollout to learn from; give at least one")
+        steps = recorded.steps * self.task.action_repeat
+        report = self._learnt_from(Collected(recorded, len(recorded)), steps, 0.0)
+        for each in callbacks_of(callback):
+            each(self, report)
+        return self
+
     def _learnt_from(self, collected: Collected, taken: int, seconds: float) -> IterationReport:
         """Update from the rollouts of an iteration.
 

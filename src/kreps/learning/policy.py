@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import operator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,10 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from kreps.data.history import first_lags, next_lags, states_of
+from kreps.data.rollouts import Rollout
 from kreps.errors import ConfigurationError, DataError
 from kreps.intake import as_flags, as_numbers
 from kreps.kernels.arrays import FloatArray, IntArray, default_errstate
 from kreps.learning import storage
+from kreps.learning.extrapolation import Extrapolation, extrapolation_of
 from kreps.learning.storage.onnx import write_onnx
 from kreps.policies.base import LearntPolicy
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
@@ -186,6 +189,26 @@ class Policy:
                 f"low_rank=kreps.LowRank(rank={count})"
             )
         return self
+
+    @default_errstate()
+    def extrapolation(self, rollouts: Iterable[Rollout]) -> Extrapolation:
+        """How far this policy goes beyond recordings of another controller.
+
+        Args:
+            rollouts: of the recorded controller, such as those that the policy was learnt from.
+
+        Returns:
+            Effective sample size of the steps, and the share of the actions outside the data.
+
+        Raises:
+            ConfigurationError: the policy is no Gaussian process.
+            DataError: no rollout, or widths that are not the task's.
+        """
+        process = self.process
+        if not isinstance(process, CostSensitiveGP | SparseGP):
+            raise ConfigurationError(_no_process(process, "compare"))
+        rng = generator(self.seed, Purpose.EXTRAPOLATION, self.iteration)
+        return extrapolation_of(process, rollouts, rng)
 
     @default_errstate()
     def export_onnx(self, path: str | Path, dtype: str = "float64") -> str:

@@ -1,4 +1,4 @@
-"""The command line: train, resume, settings, evaluate, plot, diagnose, video, export and so on.
+"""The command line: train, resume, import, settings, evaluate, diagnose, export and so on.
 
 Each module has the commands of one purpose; this one assembles them.
 """
@@ -27,6 +27,7 @@ from kreps.app.cli.inspect import (
     plot,
     video,
 )
+from kreps.app.cli.recorded import IMPORT_EXAMPLES, import_
 from kreps.app.cli.reproduce import REPRODUCE_EXAMPLES, SEARCH_EXAMPLES, reproduce, search
 from kreps.app.cli.settings import SETTINGS_EXAMPLES, settings, settings_help
 from kreps.app.cli.train import RESUME_EXAMPLES, TRAIN_EXAMPLES, resume, train
@@ -52,14 +53,20 @@ def options(
         raise typer.Exit
 
 
-def _add(command: Callable[..., Any], examples: Sequence[str], more_help: str = "") -> None:
+def _add(
+    command: Callable[..., Any],
+    examples: Sequence[str],
+    more_help: str = "",
+    name: str | None = None,
+) -> None:
     lines = "\n\n".join(f"  {example}" for example in examples)
     text = f"{getdoc(command)}\n\n{more_help}"
-    app.command(cls=Command, help=text, epilog=f"Examples:\n\n{lines}")(command)
+    app.command(name, cls=Command, help=text, epilog=f"Examples:\n\n{lines}")(command)
 
 
 _add(train, TRAIN_EXAMPLES, settings_help())
 _add(resume, RESUME_EXAMPLES)
+_add(import_, IMPORT_EXAMPLES, name="import")
 _add(settings, SETTINGS_EXAMPLES)
 _add(evaluate, EVALUATE_EXAMPLES)
 _add(plot, PLOT_EXAMPLES)
