@@ -32,31 +32,31 @@ MARK = re.compile(r"^<!-- generated: (.+?) -->$", re.MULTILINE)
 
 
 def cell(text: str) -> str:
-    """Text for a cell of a table: types and names of sections as code, no line ends, no bars."""
+    """Text for a cell of a table, without line ends and bars."""
     return " ".join(text.split()).replace("|", "\\|")
 
 
-def shown(value: Any) -> str:
-    return f"`{value!r}`"
+def values_of(name: str, default: Any, presets: dict[str, dict[str, Any]]) -> str:
+    """The default of a setting, and its value in each preset where that is another one."""
+    lines = [f"`{default!r}`"]
+    for preset, values in presets.items():
+        if name in values and values[name] != default:
+            lines.append(f"{preset}: `{values[name]!r}`")
+    return "<br>".join(lines)
 
 
 def rows_of(kind: type[Any], prefix: str = "") -> Iterator[str]:
     """A table of the fields of a class of settings that are no sections."""
-    presets = PRESETS if kind is Settings or prefix else {}
-    heads = ["setting", "type", *(presets or ["default"]), "meaning"]
-    yield "| " + " | ".join(heads) + " |"
-    yield "|---" * len(heads) + "|"
-    default = flat(kind())
-    values = {name: flat(preset) for name, preset in presets.items()}
-    meaning = descriptions(kind)
+    yield "| setting | default | meaning |\n|---|---|---|"
+    defaults, meaning = flat(kind()), descriptions(kind)
+    presets = {name: flat(preset) for name, preset in PRESETS.items()}
+    used = presets if kind is Settings or prefix else {}
     for each in fields(kind):
-        name = prefix + each.name
-        if each.name not in default:
-            continue
-        columns = [of.get(name, "-") for of in values.values()] if values else [default[each.name]]
-        cells = [shown(value) if value != "-" else "-" for value in columns]
-        text = [f"`{name}`", f"`{cell(str(each.type))}`", *cells, cell(meaning[each.name])]
-        yield "| " + " | ".join(text) + " |"
+        if each.name in defaults and each.name in meaning:
+            name = prefix + each.name
+            values = values_of(name, defaults[each.name], used)
+            text = f"{meaning[each.name]} (`{each.type}`)"
+            yield f"| `{name}` | {cell(values)} | {cell(text)} |"
 
 
 def settings() -> str:
