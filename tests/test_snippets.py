@@ -1,7 +1,7 @@
 """Every snippet of README and of the site runs, and prints what its page shows.
 
-Tutorials run as they are.  Elsewhere names that a page takes for granted, such as a robot, are given
-here, and learning is made short.  The pages of docs/methods have a test of their own.
+Tutorials run as they are.  Elsewhere names that a page takes for granted, such as a robot, are
+given here, and learning is made short.  The pages of docs/methods have a test of their own.
 """
 
 from __future__ import annotations
@@ -189,12 +189,15 @@ class Reduced(ast.NodeTransformer):
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty current folder, with the examples importable."""
+    registered = set(gym.registry)
     (tmp_path / "recordings").mkdir()
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     yield tmp_path
     for example in (ROOT / "examples").glob("*.py"):
         sys.modules.pop(example.stem, None)
+    for name in set(gym.registry) - registered:
+        del gym.registry[name]
 
 
 def run(code: str, page: Path, names: dict[str, Any], *, whole: bool) -> None:

@@ -8,7 +8,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import fields
-from typing import Any
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import typer.main
 from rich.text import Text
@@ -37,26 +38,37 @@ def cell(text: str) -> str:
 
 
 def values_of(name: str, default: Any, presets: dict[str, dict[str, Any]]) -> str:
-    """The default of a setting, and its value in each preset where that is another one."""
-    lines = [f"`{default!r}`"]
+    """The default of a setting, and below it the presets in which it has another value."""
+    others: dict[str, list[str]] = {}
     for preset, values in presets.items():
         if name in values and values[name] != default:
-            lines.append(f"{preset}: `{values[name]!r}`")
-    return "<br>".join(lines)
+            others.setdefault(f"`{values[name]!r}`", []).append(preset)
+    return "<br>".join([f"`{default!r}`", *(f"{', '.join(o)}: {v}" for v, o in others.items())])
+
+
+def type_of(hint: Any) -> str:
+    """A type in words: the alternatives of a union, the values of a choice."""
+    if get_origin(hint) is Literal:
+        return " or ".join(map(repr, get_args(hint)))
+    if get_origin(hint) in (Union, UnionType):
+        return " or ".join(map(type_of, get_args(hint)))
+    if isinstance(hint, type):
+        return hint.__name__.replace("NoneType", "None")
+    return str(hint)
 
 
 def rows_of(kind: type[Any], prefix: str = "") -> Iterator[str]:
     """A table of the fields of a class of settings that are no sections."""
-    yield "| setting | default | meaning |\n|---|---|---|"
-    defaults, meaning = flat(kind()), descriptions(kind)
+    yield "| setting | default | type | meaning |\n|---|---|---|---|"
+    defaults, meaning, hints = flat(kind()), descriptions(kind), get_type_hints(kind)
     presets = {name: flat(preset) for name, preset in PRESETS.items()}
     used = presets if kind is Settings or prefix else {}
     for each in fields(kind):
         if each.name in defaults and each.name in meaning:
             name = prefix + each.name
             values = values_of(name, defaults[each.name], used)
-            text = f"{meaning[each.name]} (`{each.type}`)"
-            yield f"| `{name}` | {cell(values)} | {cell(text)} |"
+            cells = [f"`{name}`", values, type_of(hints[each.name]), meaning[each.name]]
+            yield f"| {' | '.join(map(cell, cells))} |"
 
 
 def settings() -> str:
@@ -74,7 +86,17 @@ def settings() -> str:
     ]
     lines = []
     for heading, kind, prefix in parts:
-        lines += [f"## {heading}", "", *rows_of(kind, prefix), ""]
+        table = rows_of(kind, prefix)
+        lines += [
+            f"## {heading}",
+            "",
+            '<div class="settings" markdown>',
+            "",
+            *table,
+            "",
+            "</div>",
+            "",
+        ]
     return "\n".join(lines)
 
 
