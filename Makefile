@@ -13,7 +13,7 @@ test: .venv/installed           ## all tests
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 docs: .venv/installed           ## the documentation site in site/; a broken link is an error
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 check: .venv/installed          ## formatter, linter, types, import contracts
 	$(BIN)/ruff format --check .
