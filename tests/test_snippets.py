@@ -19,12 +19,14 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import typer.main
+from recorded import columns_of, rollouts
 
 import kreps
 from kreps.app.cli import app
 
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = ROOT / "docs/tutorials"
+RECORDED_DATA = ROOT / "docs/recorded_data.md"
 PAGES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
@@ -47,11 +49,11 @@ def name_of(page: Path) -> str:
 TASK = kreps.TaskSpec(observation_size=2, action_low=[-30.0], action_high=[30.0])
 
 
-def recordings(rollouts: int = 4) -> list[kreps.Rollout]:
+def recordings(count: int = 4) -> list[kreps.Rollout]:
     rng = np.random.default_rng(0)
     return [
         kreps.Rollout(rng.normal(size=(31, 2)), 9.0 * rng.normal(size=(30, 1)), rng.normal(size=30))
-        for _ in range(rollouts)
+        for _ in range(count)
     ]
 
 
@@ -145,12 +147,23 @@ def of_delays() -> dict[str, Any]:
     }
 
 
+def of_recorded_data() -> dict[str, Any]:
+    """The description of the robot on the page, and a recording with its columns."""
+    (spec,) = [text for language, _, text in blocks(RECORDED_DATA) if language == "toml"]
+    Path("robot.toml").write_text(spec)
+    columns = columns_of(rollouts((30, 30, 30)))
+    rows, header = np.column_stack(list(columns.values())), ",".join(columns)
+    np.savetxt("recording.csv", rows, delimiter=",", header=header, comments="")
+    return {}
+
+
 TAKEN_FOR_GRANTED: dict[str, Callable[[], dict[str, Any]]] = {
     "README.md": of_readme,
     "docs/decisions/0018-checksums.md": of_checksums,
     "docs/delays.md": of_delays,
     "docs/how_to/export.md": of_export,
     "docs/performance.md": of_performance,
+    "docs/recorded_data.md": of_recorded_data,
     "docs/real_robot.md": lambda: {"kreps": kreps, **robot()},
 }
 
