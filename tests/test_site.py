@@ -41,7 +41,7 @@ def test_the_page_of_the_command_line_has_every_command_and_option() -> None:
     text = reference.command_line()
     names = [command.name or command.callback.__name__ for command in app.registered_commands]  # type: ignore[union-attr]
     assert re.findall(r"^## kreps (\w+)$", text, re.M) == names
-    assert "| `--iterations <int range>` | Policy updates to make." in text
+    assert "| `--iterations <int range>` | Policy updates to make; 20 if not given" in text
     assert "[bold]" not in text
 
 
