@@ -45,6 +45,7 @@ MODEL_BASED: dict[str, Any] = {
     "exploring_starts": 0.25,
     "model": "dynamics",
     "policy_fit": "map",
+    "cross_validation": "samples",
     "value": "rkhs",
     "value.max_rank": 400,
     "value.tolerance": 1e-6,
@@ -82,11 +83,28 @@ PAPER: dict[str, Any] = {
     "model": "embedding",
     "policy_fit": "bounded",
 }
+AUTHORS: dict[str, Any] = {
+    **{name: v for name, v in SINGLE_STEP.items() if not name.startswith("low_rank.")},
+    "exploration.noise": "gaussian",
+    "kl_bound": 0.5,
+    "eta_floor": 0.0,
+    "ridge": 1e-6,
+    "model": "embedding",
+    "policy_fit": "free",
+    "cross_validation": "rollouts",
+    "value.max_rank": 3000,
+    "low_rank": None,
+}
 
 
 @pytest.mark.parametrize(
     ("preset", "values"),
-    [("model_based", MODEL_BASED), ("single_step", SINGLE_STEP), ("paper", PAPER)],
+    [
+        ("model_based", MODEL_BASED),
+        ("single_step", SINGLE_STEP),
+        ("paper", PAPER),
+        ("authors", AUTHORS),
+    ],
 )
 def test_presets_have_these_values(preset: str, values: dict[str, Any]) -> None:
     assert flat(settings_of(preset)) == values
@@ -126,7 +144,7 @@ def test_other_learners_have_these_defaults() -> None:
 
 
 def test_an_unknown_preset_is_refused_with_the_choices() -> None:
-    choices = r"'model_based', 'single_step', 'paper'"
+    choices = r"'model_based', 'single_step', 'paper', 'authors'"
     with pytest.raises(ConfigurationError, match=rf"'papre' is unknown; .*{choices}"):
         settings_of("papre")
     with pytest.raises(ConfigurationError, match=r"called 'single_step' now"):
@@ -339,6 +357,7 @@ OUT_OF_RANGE: dict[str, list[Any]] = {
     "exploring_starts": [-0.1, 1.1, *NOT_FINITE, *NO_NUMBERS],
     "model": ["exact", "", None, ["change"]],
     "policy_fit": ["mle", "", None],
+    "cross_validation": ["loo", "", None],
     "value.max_rank": NO_COUNTS,
     "value.tolerance": [0.0, -1.0, *NOT_FINITE, *NO_NUMBERS],
     "value.angle_wrap": ["cut", "round", "", None],
@@ -448,7 +467,8 @@ AT_THE_EDGE: dict[str, list[Any]] = {
     "ridge": [None, 1e-9],
     "exploring_starts": [0, 0.0, 1.0],
     "model": ["change", "embedding"],
-    "policy_fit": ["bounded"],
+    "policy_fit": ["bounded", "free"],
+    "cross_validation": ["samples"],
     "value.max_rank": [1],
     "low_rank.above": [0],
     "model_based.actions_per_state": [1],

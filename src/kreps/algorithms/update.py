@@ -18,6 +18,7 @@ from kreps.algorithms.model_based import (
 )
 from kreps.algorithms.report import UpdateInfo
 from kreps.algorithms.reps import Batch, Step, reps_step, stationarity_ridge
+from kreps.algorithms.rollout_folds import RolloutFolds
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.data.compute import CHUNK_SIZE, Compute
 from kreps.data.dataset import Dataset
@@ -25,7 +26,7 @@ from kreps.data.rollouts import Rollout
 from kreps.errors import ConfigurationError
 from kreps.models.history_choice import HistoryChoice, choose_history
 from kreps.models.model_errors import model_errors
-from kreps.settings import Settings
+from kreps.settings import Grid, Settings
 
 
 def update(
@@ -103,6 +104,8 @@ def batch_of(
             )
         return LowRankBatch(state.window, samples, settings, low_rank, clock, compute, rng)
     window = state.append(samples)
+    if settings.cross_validation == "rollouts":
+        return RolloutFolds(window, samples, settings, clock)
     if low_rank is None or window.steps <= low_rank.above:
         return ExactBatch(window, samples, settings, clock)
     return LowRankBatch(window, samples, settings, low_rank, clock, compute, rng)
@@ -114,7 +117,8 @@ def report(
     """What is only reported of an update."""
     errors, actions, task = step.model.errors, batch.actions, batch.task
     beyond = (actions < task.action_low) | (actions > task.action_high)
-    parameters = step.model.parameters
+    parameters, basis = step.model.parameters, step.features.basis
+    kernel = step.kernel if isinstance(batch.settings.value, Grid) else basis.kernel
     return UpdateInfo(
         samples=batch.size,
         kl_bound=batch.settings.kl_bound,
@@ -124,11 +128,11 @@ def report(
         held_out=model_errors(batch.data, task, step.model.dynamics, step.reward_model),
         clipped=float(np.mean(beyond)),
         rank=step.problem.rank,
-        rank_residual=step.features.basis.residual,
+        rank_residual=basis.residual,
         dual=step.dual,
         effective_samples=effective_sample_size(step.dual.weights),
         support=step.policy.support,
-        state_lengthscales=step.kernel.lengthscales,
+        state_lengthscales=kernel.lengthscales[: len(step.kernel.factors)],
         embedding_parameters=None if parameters is None else np.exp(parameters),
         policy_parameters=np.exp(step.policy.x),
         noise=step.policy.noise,

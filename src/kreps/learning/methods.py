@@ -39,7 +39,8 @@ class KREPS(OnPolicyLearner[Settings]):
     Args:
         env, seed, periodic, threads: as for `Learner`.
         preset: ``"model_based"``, ``"single_step"`` (one step on the sampled actions, without
-            generated samples), ``"paper"`` (close to the printed method) or a `kreps.Settings`.
+            generated samples), ``"paper"`` (close to the printed method), ``"authors"`` (as the
+            authors' scripts have it) or a `kreps.Settings`.
         compute: where low-rank updates compute sums over samples, and in which arrays.  It is not
             part of a checkpoint, so set it again after `resume`: ``learner.compute = ...``.
         **settings: any field of `kreps.Settings`, such as ``kl_bound=0.5``, ``value=kreps.Grid(5)``
