@@ -11,7 +11,7 @@ import pytest
 
 import kreps
 from kreps.errors import ConfigurationError
-from kreps.presets import PRESETS, changed, flat, settings_of
+from kreps.presets import PRESETS, changed, flat, preset_of, settings_of
 from kreps.settings import (
     RKHS,
     Exploration,
@@ -126,10 +126,17 @@ def test_other_learners_have_these_defaults() -> None:
         "growth": 0.0,
         "rollout_lengths": "independent",
     }
-    assert flat(ValueIterationSettings()) == {**on_policy, "temperature": 1.0, "actions": 25}
+    values = {"temperature_unit": "reward", "known_reward": False, "cross_validation": "samples"}
+    assert flat(ValueIterationSettings()) == {
+        **on_policy,
+        "temperature": 1.0,
+        "actions": 25,
+        **values,
+    }
     assert flat(NPALPSettings()) == {
         **on_policy,
         "lipschitz": 10.0,
+        "lipschitz_unit": "standardised",
         "noise_fraction": 0.3,
         "noise_scale": 0.3,
     }
@@ -140,7 +147,53 @@ def test_other_learners_have_these_defaults() -> None:
         "actions": 25,
         "grid_states": 15,
         "grid_actions": 7,
+        "temperature": 0.0,
+        **values,
     }
+
+
+def test_the_presets_of_the_other_learners_are_these() -> None:
+    values = {"temperature_unit": "q", "known_reward": True, "cross_validation": "rollouts"}
+    first = {"exploration.noise": "gaussian"}
+    changed_by: dict[type[Any], dict[str, Any]] = {
+        ValueIterationSettings: {**first, "temperature": 1.0 / 3.0, **values},
+        GridValueIterationSettings: {
+            "grid_states": (19, 11),
+            "grid_actions": 11,
+            "temperature": 0.05,
+            **values,
+        },
+        NPALPSettings: {
+            **first,
+            "lipschitz": 1.0,
+            "lipschitz_unit": "raw",
+            "noise_fraction": 0.1,
+            "noise_scale": 0.6,
+        },
+    }
+    for kind, changes in changed_by.items():
+        assert flat(preset_of(kind, "default", {})) == flat(kind())
+        assert flat(preset_of(kind, "authors", {})) == {**flat(kind()), **changes}
+        with pytest.raises(ConfigurationError, match=rf"'default', 'authors', .*{kind.__name__}"):
+            preset_of(kind, "paper", {})
+    assert kreps.NPALP(kreps.TaskSpec(1, [-1.0], [1.0]), preset="authors").settings.lipschitz == 1.0
+
+
+@pytest.mark.parametrize("kind", [ValueIterationSettings, GridValueIterationSettings])
+def test_a_known_reward_is_of_the_authors_value_iteration(kind: Any) -> None:
+    with pytest.raises(ConfigurationError, match=r'known_reward = True.*preset="authors"'):
+        kind(known_reward=True)
+    with pytest.raises(ConfigurationError, match=r"known_reward = 1,.*True or False"):
+        kind(known_reward=1, temperature_unit="q", temperature=1.0)
+    with pytest.raises(ConfigurationError, match="temperature = 0"):
+        kind(temperature=0.0, temperature_unit="q")
+
+
+def test_a_grid_may_have_a_size_for_each_coordinate() -> None:
+    assert GridValueIterationSettings(grid_states=[3, 4]).grid_states == (3, 4)  # type: ignore[arg-type]
+    for wrong in ((), (3, 0), (3, 2.0), (True, 2)):
+        with pytest.raises(ConfigurationError, match=r"grid_states = .*whole numbers"):
+            GridValueIterationSettings(grid_states=wrong)  # type: ignore[arg-type]
 
 
 def test_an_unknown_preset_is_refused_with_the_choices() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from math import inf
 from numbers import Integral, Real
-from typing import ClassVar, Literal
+from typing import Literal
 
 from kreps.checks import MAX_ACTION_REPEAT, MAX_COUNT, MAX_LAGS, MAX_WHOLE_NUMBER, Checked
 from kreps.errors import ConfigurationError, shown
@@ -20,6 +20,8 @@ TransitionModelName = Literal["dynamics", "change", "embedding", "sample"]
 RolloutLengths = Literal["independent", "stratified"]
 PolicyFitName = Literal["map", "bounded", "free"]
 CrossValidation = Literal["samples", "rollouts"]
+TemperatureUnit = Literal["reward", "q"]
+LipschitzUnit = Literal["standardised", "raw"]
 
 USUAL_RESTART_PROBABILITY = 0.02
 """That of the paper, with rollouts of 49 steps on average."""
@@ -197,17 +199,29 @@ class ValueIterationSettings(OnPolicySettings):
     Those of `OnPolicySettings`, and:
 
     Attributes:
-        temperature: of the softmax, in standard deviations of the reward.
+        temperature: of the softmax.
+        temperature_unit: ``"reward"``: standard deviations of the reward, and V is the soft maximum
+            at the same temperature; ``"q"``: standard deviations of Q over the candidates of each
+            state, and V is the maximum, as in the authors' scripts.
         actions: candidate actions, evenly spaced over the range: the largest number of levels
             per dimension whose product does not exceed this.
+        known_reward: whether the reward function of the environment's batch model is used, in place
+            of the observed rewards; only with ``temperature_unit="q"``.
+        cross_validation: what the fits hold out, as in `Settings`.
     """
 
     temperature: float = 1.0
+    temperature_unit: TemperatureUnit = "reward"
     actions: int = 25
+    known_reward: bool = False
+    cross_validation: CrossValidation = "samples"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._positive("temperature")
+        self._choose("temperature_unit", TemperatureUnit)
+        self._choose("cross_validation", CrossValidation)
+        _check_known_reward(self)
         self._whole("actions", largest=6000)  # as many as the file of a policy may hold
 
 
@@ -222,23 +236,35 @@ class GridValueIterationSettings(LearnerSettings):
         ranges: smallest and largest value of each observation coordinate on the grid; None takes
             those of the observation space.  The range of an angle is always a whole turn.
         actions: candidate actions of the maximisation, as in `ValueIterationSettings`.
-        grid_states: grid points per state coordinate.
+        grid_states: grid points per state coordinate; one number, or one for each coordinate.
         grid_actions: grid points per action coordinate.
+        temperature: as in `ValueIterationSettings`; 0, as exploration is not needed, for the
+            maximum in place of the soft maximum.
+        temperature_unit, known_reward, cross_validation: as in `ValueIterationSettings`.
     """
-
-    temperature: ClassVar[float] = 0.0
-    """Exploration is not needed: the soft maximum is the maximum."""
 
     window: int = 6000
     ranges: tuple[tuple[float, float], ...] | None = None
     actions: int = 25
-    grid_states: int = 15
+    grid_states: int | tuple[int, ...] = 15
     grid_actions: int = 7
+    temperature: float = 0.0
+    temperature_unit: TemperatureUnit = "reward"
+    known_reward: bool = False
+    cross_validation: CrossValidation = "samples"
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self._whole("grid_states", "grid_actions", largest=MAX_COUNT)
+        if isinstance(self.grid_states, tuple | list):
+            self._counts("grid_states", largest=MAX_COUNT)
+        else:
+            self._whole("grid_states", largest=MAX_COUNT)
+        self._whole("grid_actions", largest=MAX_COUNT)
         self._whole("actions", largest=6000)
+        self._check("temperature", Real, "finite and >= 0", lambda v: 0 <= v < inf)
+        self._choose("temperature_unit", TemperatureUnit)
+        self._choose("cross_validation", CrossValidation)
+        _check_known_reward(self)
         if self.ranges is not None:
             try:
                 ranges = tuple((float(low), float(high)) for low, high in self.ranges)
@@ -252,6 +278,22 @@ class GridValueIterationSettings(LearnerSettings):
             object.__setattr__(self, "ranges", ranges)
 
 
+def _check_known_reward(settings: ValueIterationSettings | GridValueIterationSettings) -> None:
+    """Raise `ConfigurationError` unless the settings about rewards and temperature agree."""
+    settings._flag("known_reward")
+    if settings.temperature_unit == "reward" and settings.known_reward:
+        raise ConfigurationError(
+            'known_reward = True with temperature_unit = "reward", but a known reward is part of '
+            'the authors\' value iteration; set temperature_unit="q", or start from '
+            'preset="authors"'
+        )
+    if settings.temperature_unit == "q" and settings.temperature == 0.0:
+        raise ConfigurationError(
+            'temperature = 0.0 with temperature_unit = "q", but the softmax needs a positive one; '
+            "a small one, such as 0.05, is nearly the maximum"
+        )
+
+
 @dataclass(frozen=True)
 class NPALPSettings(OnPolicySettings):
     """The parameters of non-parametric approximate linear programming.
@@ -259,17 +301,21 @@ class NPALPSettings(OnPolicySettings):
     Those of `OnPolicySettings`, and:
 
     Attributes:
-        lipschitz: Lipschitz constant of V, in standard deviations of the reward per median distance
-            of states.
+        lipschitz: Lipschitz constant of V.
+        lipschitz_unit: ``"standardised"``: standard deviations of the reward per median distance of
+            states; ``"raw"``: units of the reward per unit of distance, with all coordinates in
+            their own units, as in the authors' scripts.
         noise_fraction: share of the actions to which exploration noise is added, in [0, 1].
         noise_scale: standard deviation of that noise, in units of half the range.
     """
 
     lipschitz: float = 10.0
+    lipschitz_unit: LipschitzUnit = "standardised"
     noise_fraction: float = 0.3
     noise_scale: float = 0.3
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._positive("lipschitz", "noise_scale")
+        self._choose("lipschitz_unit", LipschitzUnit)
         self._check("noise_fraction", Real, "in [0, 1]", lambda v: 0 <= v <= 1)

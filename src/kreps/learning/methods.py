@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,17 +20,18 @@ from kreps.kernels.basis import LinearFunction
 from kreps.learning import timescale
 from kreps.learning.batches import Collected
 from kreps.learning.collect import collect_grid
-from kreps.learning.environment import Environment
+from kreps.learning.environment import Environment, known_reward_of
 from kreps.learning.learner import Learner
 from kreps.learning.on_policy import OnPolicyLearner
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
-from kreps.presets import settings_of
 from kreps.settings import (
     GridValueIterationSettings,
     NPALPSettings,
     Settings,
     ValueIterationSettings,
 )
+
+KnowsReward = TypeVar("KnowsReward", ValueIterationSettings, GridValueIterationSettings)
 
 
 class KREPS(OnPolicyLearner[Settings]):
@@ -65,9 +66,10 @@ class KREPS(OnPolicyLearner[Settings]):
         compute: Compute | None = None,
         **settings: Any,
     ) -> None:
-        self._preset = preset
         self.compute = compute or Compute()
-        super().__init__(env, seed=seed, periodic=periodic, threads=threads, **settings)
+        super().__init__(
+            env, seed=seed, periodic=periodic, threads=threads, preset=preset, **settings
+        )
 
     def _completed(self, task: TaskSpec, chooses: bool) -> TaskSpec:
         settings, repeat = self.settings, task.action_repeat
@@ -80,9 +82,6 @@ class KREPS(OnPolicyLearner[Settings]):
             delay=max(task.delay, settings.delay),
             history=max(task.history, history),
         )
-
-    def _settings(self, changes: dict[str, Any]) -> Settings:
-        return settings_of(self._preset, **changes)
 
     def update(self, rollouts: Iterable[Rollout] | Dataset) -> UpdateReport:
         """One update from new rollouts, collected anywhere, and those that the window has kept.
@@ -122,7 +121,17 @@ class KREPS(OnPolicyLearner[Settings]):
         return self.state.value
 
 
-class ValueIteration(OnPolicyLearner[ValueIterationSettings]):
+class KnownReward(Learner[KnowsReward]):
+    """A learner that may be given the reward function of its environment."""
+
+    def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:
+        known = known_reward_of(self.env) if self.settings.known_reward else None
+        return value_iteration.update(
+            self.state, samples, self.task, self.update_settings, rng, known
+        )
+
+
+class ValueIteration(KnownReward[ValueIterationSettings], OnPolicyLearner[ValueIterationSettings]):
     """Value iteration with RKHS embeddings and a softmax policy (Gruenewaelder et al. 2012).
 
     Arguments and errors are those of `Learner`, settings those of
@@ -131,10 +140,9 @@ class ValueIteration(OnPolicyLearner[ValueIterationSettings]):
 
     method = "value-iteration"
     settings_type = ValueIterationSettings
-    algorithm = staticmethod(value_iteration.update)
 
 
-class GridValueIteration(Learner[GridValueIterationSettings]):
+class GridValueIteration(KnownReward[GridValueIterationSettings]):
     """Off-policy value iteration with RKHS embeddings on a grid of states and actions.
 
     Each iteration takes one step from every grid point; one iteration is enough.  The environment
@@ -148,7 +156,6 @@ class GridValueIteration(Learner[GridValueIterationSettings]):
 
     method = "grid-value-iteration"
     settings_type = GridValueIterationSettings
-    algorithm = staticmethod(value_iteration.update)
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Collected:
         settings = self.settings
