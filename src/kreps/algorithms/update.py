@@ -16,6 +16,7 @@ from kreps.algorithms.model_based import (
     has_acceptance_test,
     model_based_step,
 )
+from kreps.algorithms.policy_divergence import expected_policy_kl
 from kreps.algorithms.report import UpdateInfo
 from kreps.algorithms.reps import Batch, Step, reps_step, stationarity_ridge
 from kreps.algorithms.rollout_folds import RolloutFolds
@@ -26,6 +27,7 @@ from kreps.data.rollouts import Rollout
 from kreps.errors import ConfigurationError
 from kreps.models.history_choice import HistoryChoice, choose_history
 from kreps.models.model_errors import model_errors
+from kreps.policies.base import LearntPolicy
 from kreps.settings import Grid, Settings
 
 
@@ -65,7 +67,7 @@ def update(
         reward_start=reward_start,
         policy_start=step.policy.x,
     )
-    return new_state, report(batch, step, rejected, choice)
+    return new_state, report(batch, step, state.policy, rejected, choice)
 
 
 def history_choice(
@@ -112,9 +114,13 @@ def batch_of(
 
 
 def report(
-    batch: Batch[Any, Any], step: Step, rejected: bool | None, choice: HistoryChoice | None
+    batch: Batch[Any, Any],
+    step: Step,
+    previous: LearntPolicy | None,
+    rejected: bool | None,
+    choice: HistoryChoice | None,
 ) -> UpdateInfo:
-    """What is only reported of an update."""
+    """What is only reported of an update, with the policy before it."""
     errors, actions, task = step.model.errors, batch.actions, batch.task
     beyond = (actions < task.action_low) | (actions > task.action_high)
     parameters, basis = step.model.parameters, step.features.basis
@@ -136,6 +142,7 @@ def report(
         embedding_parameters=None if parameters is None else np.exp(parameters),
         policy_parameters=np.exp(step.policy.x),
         noise=step.policy.noise,
+        policy_kl=expected_policy_kl(step.policy.policy, previous, batch.data),
         rejected=rejected,
         jitter=max([step.dual.jitter, *batch.jitters]),
         history_choice=choice,
