@@ -31,7 +31,9 @@ from kreps.settings import (
     ValueIterationSettings,
 )
 
-KnowsReward = TypeVar("KnowsReward", ValueIterationSettings, GridValueIterationSettings)
+AnyValueIterationSettings = TypeVar(
+    "AnyValueIterationSettings", ValueIterationSettings, GridValueIterationSettings
+)
 
 
 class KREPS(OnPolicyLearner[Settings]):
@@ -121,8 +123,8 @@ class KREPS(OnPolicyLearner[Settings]):
         return self.state.value
 
 
-class KnownReward(Learner[KnowsReward]):
-    """A learner that may be given the reward function of its environment."""
+class AnyValueIteration(Learner[AnyValueIterationSettings]):
+    """Value iteration on any data; the reward function of the environment may be known."""
 
     def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:
         known = known_reward_of(self.env) if self.settings.known_reward else None
@@ -131,7 +133,9 @@ class KnownReward(Learner[KnowsReward]):
         )
 
 
-class ValueIteration(KnownReward[ValueIterationSettings], OnPolicyLearner[ValueIterationSettings]):
+class ValueIteration(
+    AnyValueIteration[ValueIterationSettings], OnPolicyLearner[ValueIterationSettings]
+):
     """Value iteration with RKHS embeddings and a softmax policy (Gruenewaelder et al. 2012).
 
     Arguments and errors are those of `Learner`, settings those of
@@ -142,7 +146,7 @@ class ValueIteration(KnownReward[ValueIterationSettings], OnPolicyLearner[ValueI
     settings_type = ValueIterationSettings
 
 
-class GridValueIteration(KnownReward[GridValueIterationSettings]):
+class GridValueIteration(AnyValueIteration[GridValueIterationSettings]):
     """Off-policy value iteration with RKHS embeddings on a grid of states and actions.
 
     Each iteration takes one step from every grid point; one iteration is enough.  The environment
