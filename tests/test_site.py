@@ -30,9 +30,9 @@ def test_the_table_of_settings_has_each_setting_once_with_its_values() -> None:
             default, *_ = cells(name)
             assert default.startswith(f"`{value!r}`"), name
     default, kind, meaning = cells("kl_bound")
-    assert default == "`1.0`<br>paper: `0.5`" and kind == "float" and "Eq. 2" in meaning
+    assert default == "`1.0`<br>paper, authors: `0.5`" and kind == "float" and "Eq. 2" in meaning
     default, kind, _ = cells("rollout_lengths")
-    assert default == "`'stratified'`<br>single_step, paper: `'independent'`"
+    assert default == "`'stratified'`<br>single_step, paper, authors: `'independent'`"
     assert kind == "'independent' or 'stratified'"
     assert cells("history")[1] == "int or 'auto'"
 

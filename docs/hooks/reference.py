@@ -16,7 +16,7 @@ from rich.text import Text
 
 from kreps.app.cli import app
 from kreps.app.cli.settings import descriptions
-from kreps.presets import PRESETS, flat
+from kreps.presets import PRESETS, PRESETS_OF, flat
 from kreps.settings import (
     RKHS,
     Exploration,
@@ -61,12 +61,11 @@ def rows_of(kind: type[Any], prefix: str = "") -> Iterator[str]:
     """A table of the fields of a class of settings that are no sections."""
     yield "| setting | default | type | meaning |\n|---|---|---|---|"
     defaults, meaning, hints = flat(kind()), descriptions(kind), get_type_hints(kind)
-    presets = {name: flat(preset) for name, preset in PRESETS.items()}
-    used = presets if kind is Settings or prefix else {}
+    presets = {name: flat(preset) for name, preset in PRESETS_OF.get(kind, PRESETS).items()}
     for each in fields(kind):
         if each.name in defaults and each.name in meaning:
             name = prefix + each.name
-            values = values_of(name, defaults[each.name], used)
+            values = values_of(name, defaults[each.name], presets)
             cells = [f"`{name}`", values, type_of(hints[each.name]), meaning[each.name]]
             yield f"| {' | '.join(map(cell, cells))} |"
 

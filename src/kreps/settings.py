@@ -240,7 +240,9 @@ class GridValueIterationSettings(LearnerSettings):
         grid_actions: grid points per action coordinate.
         temperature: as in `ValueIterationSettings`; 0, as exploration is not needed, for the
             maximum in place of the soft maximum.
-        temperature_unit, known_reward, cross_validation: as in `ValueIterationSettings`.
+        temperature_unit: as in `ValueIterationSettings`.
+        known_reward: as in `ValueIterationSettings`.
+        cross_validation: as in `ValueIterationSettings`.
     """
 
     window: int = 6000
