@@ -1,9 +1,9 @@
-# For users: `make demo` and `make test`.  The other targets are for developers.
+# For users: `make demo`, `make test` and `make docs`.  The other targets are for developers.
 
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check bench format clean constraints tables dist
+.PHONY: demo test docs check bench format clean constraints tables dist
 
 demo: .venv/installed           ## learn the swing-up; writes pictures and policy to runs/demo
 	rm -rf runs/demo
@@ -11,6 +11,9 @@ demo: .venv/installed           ## learn the swing-up; writes pictures and polic
 
 test: .venv/installed           ## all tests
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
+
+docs: .venv/installed           ## the documentation site in site/; a broken link is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 check: .venv/installed          ## formatter, linter, types, import contracts, stale results
 	$(BIN)/ruff format --check .
@@ -34,7 +37,7 @@ format: .venv/installed
 	touch $@
 
 constraints:                    ## update constraints.txt (needs uv)
-	uv pip compile pyproject.toml --extra dev --extra bench --universal --generate-hashes \
+	uv pip compile pyproject.toml --extra dev --extra bench --extra docs --universal --generate-hashes \
 	  --no-annotate --no-header --upgrade --quiet -o constraints.txt
 
 tables:                         ## write the tables of results/ into the documentation pages
@@ -48,4 +51,4 @@ dist: .venv/installed           ## wheel and sdist in dist/, checked for the pac
 	build/twine/bin/python -m twine check --strict dist/*
 
 clean:
-	rm -rf .venv runs build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis
+	rm -rf .venv runs build dist site .mypy_cache .ruff_cache .pytest_cache .hypothesis

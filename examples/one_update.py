@@ -73,14 +73,15 @@ args = parser.parse_args([] if NOTEBOOK else None)
 # %% [markdown]
 # ## The problem
 #
-# A bead moves on a ring. Its state `s` is its position, an angle in rad from the goal at 0. The
-# action `a` is a commanded velocity in rad/s, clipped to ±2 before it is applied. In each period of
-# 0.3 s the bead moves by 0.3 s times the applied velocity, plus noise of standard deviation
-# 0.25 rad. The reward of a step is `r = cos(s) - 1`: 0 at the goal, -2 opposite to it. The reward
-# does not depend on the action, so actions differ only in the rewards of *later* steps.
+# A bead moves on a ring. Its state $s$ is its position, an angle in rad from the goal at 0. The
+# action $a$ is a commanded velocity in rad/s, clipped to ±2 before it is applied. In each period
+# of 0.3 s the bead moves by 0.3 s times the applied velocity, plus noise of standard deviation
+# 0.25 rad. The reward of a step is $r = \cos(s) - 1$: 0 at the goal, -2 opposite to it. The
+# reward does not depend on the action, so actions differ only in the rewards of *later* steps.
 #
-# The process restarts with probability `1 - gamma = 1/16` per step. Then the rollout ends, and the
-# next one starts at a uniformly random position. The objective is the average reward per step.
+# The process restarts with probability $1 - \gamma = 1/16$ per step. Then the rollout ends, and
+# the next one starts at a uniformly random position. The objective is the average reward per
+# step.
 
 # %%
 PERIOD, NOISE, GAMMA = 0.3, 0.25, 15 / 16
@@ -180,9 +181,9 @@ def show(figure: Figure, name: str) -> None:
 # %% [markdown]
 # ## 1. The data
 #
-# The first policy explores: in every state it draws a velocity `a ~ N(0, 1.4^2)`
-# ([`Gaussian`](../src/kreps/policies/exploration.py)). A few rollouts give `n` samples
-# `(s_i, a_i, r_i, s'_i)`, where `s'_i` is the successor of `s_i`
+# The first policy explores: in every state it draws a velocity $a \sim \mathcal{N}(0, 1.4^2)$
+# ([`Gaussian`](../src/kreps/policies/exploration.py)). A few rollouts give $n$ samples
+# $(s_i, a_i, r_i, s_i')$, where $s_i'$ is the successor of $s_i$
 # ([`Transitions`](../src/kreps/data/rollouts.py)). The samples, the restart probability and the
 # limits of the action are the only input of the learner. The dynamics and the reward function are
 # not.
@@ -217,21 +218,22 @@ show(figure, "1_data")
 #
 # A kernel measures the similarity of two states. On the ring it is periodic,
 #
-# `k(s, t) = exp(-2 sin^2((s - t) / 2) / l^2)` ([`Periodic`](../src/kreps/kernels/kernel.py)).
+# $k(s, t) = \exp(-2 \sin^2((s - t) / 2) / l^2)$ ([`Periodic`](../src/kreps/kernels/kernel.py)).
 #
-# The lengthscale `l` is the median distance of the samples
+# The lengthscale $l$ is the median distance of the samples
 # ([`state_kernel`](../src/kreps/models/transition.py)). The kernel values of all pairs of sampled
 # states form the Gram matrix (left). With the states sorted by position, it is large along the
 # diagonal and in two corners, because positions near -π and π are neighbours on the ring.
 #
 # Functions of the state are weighted sums of kernels at the sampled states (Eq. 3 of the paper).
 # Neighbouring kernels are nearly the same function, so few are needed. Pivoted Cholesky selects
-# states, the *pivots*, until no kernel function has more than 1e-6 of its squared norm outside the
-# span of the selected ones (right). This gives orthonormal features `phi_1(s), ..., phi_m(s)`,
-# together the vector `phi(s)` ([`RKHSBasis.fit`](../src/kreps/kernels/basis.py)). Middle: the first
-# four features, each with a dot at its pivot, and grey marks at the other pivots. From here on a
-# function of the state is `phi(s)' theta` with a short vector `theta`. A dash after a vector or a
-# matrix denotes its transpose.
+# states, the *pivots*, until no kernel function has more than 1e-6 of its squared norm outside
+# the span of the selected ones (right). This gives orthonormal features
+# $\phi_1(s), \dots, \phi_m(s)$, together the vector $\phi(s)$
+# ([`RKHSBasis.fit`](../src/kreps/kernels/basis.py)). Middle: the first four features, each with a
+# dot at its pivot, and grey marks at the other pivots. From here on a function of the state is
+# $\phi(s)^\top \theta$ with a short vector $\theta$. The symbol $\top$ denotes the
+# transpose of a vector or a matrix.
 
 # %%
 update_rng = np.random.default_rng([args.seed, 1])
@@ -278,29 +280,29 @@ show(figure, "2_kernel")
 # ## 3. The embedding: expected successors
 #
 # A single observed successor is a poor estimate of the effect of an action, because the noise is
-# nearly as large as the effect. The expectation of a function `f` of the successor is therefore
-# estimated from *all* samples, through the change of `f` (Eq. 4, applied to the change instead of
+# nearly as large as the effect. The expectation of a function $f$ of the successor is therefore
+# estimated from *all* samples, through the change of $f$ (Eq. 4, applied to the change instead of
 # the value):
 #
-# `E[f(s') | s, a] = f(s) + sum_i beta_i(s, a) (f(s'_i) - f(s_i))` with
-# `beta(s, a) = (K + lambda I)^-1 k(s, a)`.
+# $\mathbb{E}[f(s') \mid s, a] = f(s) + \sum_i \beta_i(s, a) (f(s_i') - f(s_i))$ with
+# $\beta(s, a) = (K + \lambda I)^{-1} k(s, a)$.
 #
-# `K` holds the kernel values of all pairs of samples, now over states *and* applied actions. The
-# vector `k(s, a)` holds the kernel values of the samples with the pair `(s, a)`. The regulariser
-# `lambda` accounts for the noise. The strength `beta_i` is the weight of sample `i`
+# $K$ holds the kernel values of all pairs of samples, now over states *and* applied actions. The
+# vector $k(s, a)$ holds the kernel values of the samples with the pair $(s, a)$. The regulariser
+# $\lambda$ accounts for the noise. The strength $\beta_i$ is the weight of sample $i$
 # ([`KernelEmbedding.strengths`](../src/kreps/kernels/regression.py)). Far from the data all
-# strengths are near zero, and the estimate is `f(s)`: the state does not change. Without the
+# strengths are near zero, and the estimate is $f(s)$: the state does not change. Without the
 # difference, the estimate there would be zero, which is a worse guess. The lengthscales and
-# `lambda` minimise the leave-one-out error of the predicted changes of the features
+# $\lambda$ minimise the leave-one-out error of the predicted changes of the features
 # ([`fit_embedding`](../src/kreps/models/transition.py)).
 #
 # Left: the strengths for the pair at the star. Samples close to it in state and action have the
-# largest ones. Middle: for the same pair, the expected kernel value `E[k(t, s')]` of the successor
-# and each position `t`. The dotted curve is the estimate without data, for which the state does
-# not change. The embedding is close to the truth, which is computed from the simulation and is not
-# an input of the learner. Right: the expectations of one function, the kernel at the goal
-# `f(s') = k(0, s')`, for all samples against the truth. The single observed values scatter widely
-# about the dashed line. The embedding averages most of the noise out.
+# largest ones. Middle: for the same pair, the expected kernel value $\mathbb{E}[k(t, s')]$ of the
+# successor and each position $t$. The dotted curve is the estimate without data, for which the
+# state does not change. The embedding is close to the truth, which is computed from the
+# simulation and is not an input of the learner. Right: the expectations of one function, the
+# kernel at the goal $f(s') = k(0, s')$, for all samples against the truth. The single observed
+# values scatter widely about the dashed line. The embedding averages most of the noise out.
 
 # %%
 successors = successor_features(data, features)  # a row phi(s'_i) per sample
@@ -378,36 +380,39 @@ show(figure, "3_embedding")
 # %% [markdown]
 # ## 4. The dual: sample weights within a KL bound
 #
-# Each sample gets a weight `p_i >= 0`; the weights sum to one. They maximise the weighted reward
-# `sum_i p_i r_i` under two constraints.
+# Each sample gets a weight $p_i \ge 0$; the weights sum to one. They maximise the weighted reward
+# $\sum_i p_i r_i$ under two constraints.
 #
-# *KL bound*: `KL(p || uniform) = sum_i p_i log(n p_i)`, the divergence of the weights from the
-# empirical distribution, is at most `epsilon` (here 1 nat). It limits the size of the step.
+# *KL bound*: $\mathrm{KL}(p \,\|\, \mathrm{uniform}) = \sum_i p_i \log(n p_i)$, the divergence of
+# the weights from the empirical distribution, is at most $\epsilon$ (here 1 nat). It limits the
+# size of the step.
 #
 # *Stationarity*: the distribution of states equals the distribution of successors, restarts
 # included. Without this constraint the weights would select the samples near the goal, whether or
-# not the goal can be reached that often. In features the constraint is `B'p = 0`, where row `i` of
-# `B` is
+# not the goal can be reached that often. In features the constraint is $B^\top p = 0$, where row
+# $i$ of $B$ is
 #
-# `gamma E[phi(s') | s_i, a_i] + (1 - gamma) mean phi(s0) - phi(s_i)`
+# $\gamma\, \mathbb{E}[\phi(s') \mid s_i, a_i] +
+# (1 - \gamma)\, \mathrm{mean}\, \phi(s_0) - \phi(s_i)$
 #
-# with the start states `s0` ([`feature_differences`](../src/kreps/models/transition.py)). Because
-# `B` is an estimate, the constraint is softened by a ridge `rho`.
+# with the start states $s_0$ ([`feature_differences`](../src/kreps/models/transition.py)).
+# Because $B$ is an estimate, the constraint is softened by a ridge $\rho$.
 #
-# The Lagrange multipliers are the temperature `eta > 0` for the KL bound and a vector `theta` for
-# stationarity. They minimise the dual function
+# The Lagrange multipliers are the temperature $\eta > 0$ for the KL bound and a vector $\theta$
+# for stationarity. They minimise the dual function
 #
-# `g(eta, theta) = eta epsilon + eta log( 1/n sum_i exp(delta_i / eta) ) + rho/2 theta'theta`
+# $g(\eta, \theta) = \eta \epsilon + \eta \log
+# \bigl( \frac{1}{n} \sum_i \exp(\delta_i / \eta) \bigr) + \frac{\rho}{2} \theta^\top \theta$
 #
-# with `delta = R + B theta` (Eqs. 2 and 5), where `R` are the rewards minus the largest one, in
+# with $\delta = R + B \theta$ (Eqs. 2 and 5), where $R$ are the rewards minus the largest one, in
 # units of their standard deviation. The dual is convex, so Newton's method finds its minimum, the
 # star ([`solve_dual`](../src/kreps/algorithms/newton.py)).
 #
-# Left: `g` over the temperature and along the direction of the optimal vector, `theta*`. Each
-# contour is 1.6 times as far above the minimum as the next inner one. Right: `g` and the KL
-# divergence, with the optimal `theta` for each temperature. The slope of the upper curve in `eta`
-# is `epsilon - KL`, so its minimum is where KL crosses the bound. The dotted line is the smallest
-# temperature that is permitted (`eta_floor`). It is not active here.
+# Left: $g$ over the temperature and along the direction of the optimal vector, $\theta^*$. Each
+# contour is 1.6 times as far above the minimum as the next inner one. Right: $g$ and the KL
+# divergence, with the optimal $\theta$ for each temperature. The slope of the upper curve in
+# $\eta$ is $\epsilon - \mathrm{KL}$, so its minimum is where KL crosses the bound. The dotted
+# line is the smallest temperature that is permitted (`eta_floor`). It is not active here.
 
 # %%
 starts = features[data.start].mean(axis=0)
@@ -467,25 +472,25 @@ show(figure, "4_dual")
 # %% [markdown]
 # ## 5. Bellman errors, weights and the value function
 #
-# The multiplier `theta` defines a function of the state, the *value function*
-# `V(s) = phi(s)' theta`: the expected sum of later rewards, up to a constant
-# ([`KernelExpansion`](../src/kreps/kernels/basis.py)). So `delta_i` is the Bellman error
-# `r_i + E[V(s') | s_i, a_i] - V(s_i)`, restarts included: the reward of the action and the value
-# after it, compared with the value before it
+# The multiplier $\theta$ defines a function of the state, the *value function*
+# $V(s) = \phi(s)^\top \theta$: the expected sum of later rewards, up to a constant
+# ([`KernelExpansion`](../src/kreps/kernels/basis.py)). So $\delta_i$ is the Bellman error
+# $r_i + \mathbb{E}[V(s') \mid s_i, a_i] - V(s_i)$, restarts included: the reward of the action
+# and the value after it, compared with the value before it
 # ([`bellman_errors`](../src/kreps/algorithms/dual.py)). The weights are (Eq. 1)
 #
-# `p_i = exp(delta_i / eta) / sum_j exp(delta_j / eta)`
+# $p_i = \exp(\delta_i / \eta) / \sum_j \exp(\delta_j / \eta)$
 # ([`sample_weights`](../src/kreps/algorithms/dual.py)).
 #
 # Top left: unlike the rewards, the Bellman errors change from bottom to top. Left of the goal
 # positive velocities have the larger errors, right of it negative ones. Top right: the area of a
-# point is its weight. Bottom left: `V` is largest near the goal.
+# point is its weight. Bottom left: $V$ is largest near the goal.
 #
 # Bottom right: the effect of the stationarity constraint. The curve is the density of arrivals
-# minus the density of visits, both smoothed by the kernel: `phi(s)' B'p`. With weights from the
-# rewards alone (`theta = 0`), visits to the goal would exceed arrivals there, which no policy can
-# achieve. With the optimal `theta` the curve is flat up to the softness of the constraint:
-# `B'p = -rho theta`.
+# minus the density of visits, both smoothed by the kernel: $\phi(s)^\top B^\top p$. With weights
+# from the rewards alone ($\theta = 0$), visits to the goal would exceed arrivals there, which no
+# policy can achieve. With the optimal $\theta$ the curve is flat up to the softness of the
+# constraint: $B^\top p = -\rho\, \theta$.
 
 # %%
 delta = bellman_errors(problem, dual.theta)
@@ -528,16 +533,16 @@ show(figure, "5_weights")
 # ## 6. The policy
 #
 # The weights are defined at the samples only; a policy is needed for *every* state. It is a
-# Gaussian process fitted to the weighted samples, in which a sample of weight `w` counts as `w`
+# Gaussian process fitted to the weighted samples, in which a sample of weight $w$ counts as $w$
 # samples ([`CostSensitiveGP`](../src/kreps/policies/cost_sensitive_gp.py)):
 #
-# `mean(s) = k(s)' C^-1 U` and `sd(s)^2 = sf2 - k(s)' C^-1 k(s) + l` with
-# `C = sf2 K + l diag(1/w)`.
+# $\mu(s) = k(s)^\top C^{-1} U$ and $\sigma(s)^2 = \sigma_f^2 - k(s)^\top C^{-1} k(s) + l$ with
+# $C = \sigma_f^2 K + l\, \mathrm{diag}(1/w)$.
 #
-# `U` are the commanded actions in units of their limit. `K` holds the kernel values of all pairs
-# of sampled states, and `k(s)` those with the state `s`, times `sf2`. The weights are
-# `w = p / sum_i p_i^2`. The variances `sf2` of the mean and `l` of the noise are fitted, and so is
-# the lengthscale of this kernel
+# $U$ are the commanded actions in units of their limit. $K$ holds the kernel values of all pairs
+# of sampled states, and $k(s)$ those with the state $s$, times $\sigma_f^2$. The weights are
+# $w = p / \sum_i p_i^2$. The variances $\sigma_f^2$ of the mean and $l$ of the noise are fitted,
+# and so is the lengthscale of this kernel
 # ([`policy_hyperparameters`](../src/kreps/algorithms/policy_targets.py)). Samples of negligible
 # weight are left out. The exploration noise is at most the variance of the weighted actions
 # ([`exploration_noise`](../src/kreps/algorithms/policy_targets.py)).
@@ -599,10 +604,10 @@ show(figure, "6_policy")
 # ## The same in one call
 #
 # The six steps are the body of [`reps_step`](../src/kreps/algorithms/reps.py), which
-# [`update`](../src/kreps/algorithms/update.py) calls. It gives the same policy. The numbers printed
-# here belong to the pictures; `V` and the average rewards are in units of the reward. The duality
-# gap is zero at the optimum, up to the tolerance to which KL meets its bound. The seed was selected
-# among four for clear pictures; `--seed` and `--rollouts` give others.
+# [`update`](../src/kreps/algorithms/update.py) calls. It gives the same policy. The numbers
+# printed here belong to the pictures; $V$ and the average rewards are in units of the reward. The
+# duality gap is zero at the optimum, up to the tolerance to which KL meets its bound. The seed
+# was selected among four for clear pictures; `--seed` and `--rollouts` give others.
 
 # %%
 start = LearnerState(ReplayWindow(task, args.rollouts))

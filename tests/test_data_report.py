@@ -225,19 +225,16 @@ def test_a_first_policy_is_learnt_from_recorded_data_alone(
     assert not (tmp_path / "x").exists()
 
 
-def test_the_page_about_recorded_data_does_what_it_says(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_the_commands_of_the_page_about_recorded_data_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pd = pytest.importorskip("pandas")
     monkeypatch.chdir(tmp_path)
     pd.DataFrame(columns_of(pushes(2))).to_csv("recording.csv", index=False)
     page = (Path(__file__).resolve().parents[1] / "docs/recorded_data.md").read_text()
     blocks = re.findall(r"^```(\w*)\n(.*?)^```", page, re.M | re.S)
-    (script,) = [text for language, text in blocks if language == "python"]
     (spec,) = [text for language, text in blocks if language == "toml"]
     Path("robot.toml").write_text(spec)
-    exec(compile(script, "recorded_data.md", "exec"), {})
-    assert "of 120 recorded steps are effective samples" in capsys.readouterr().out
     commands = [line for language, text in blocks if not language for line in text.splitlines()]
     imports = [line.split()[1:] for line in commands if line.startswith("kreps import rec")]
     assert len(imports) == 2

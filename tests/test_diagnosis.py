@@ -795,6 +795,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
         clipped=0.25,
         eta_floor=0.1,
         ridge=0.03,
+        policy_kl=0.7,
         rejected=True,
         seconds={},
     )
@@ -825,7 +826,7 @@ def test_a_row_has_what_the_diagnosis_needs() -> None:
     assert row["worst_coordinate"] == 2 and row["reward_error"] == 0.4
     assert np.isnan(row["termination_error"])
     assert (row["mean_return"], row["terminated"]) == (-20.0, 0.1)
-    assert row["explorer_share"] == 0.4
+    assert row["explorer_share"] == 0.4 and row["policy_kl"] == 0.7
     assert row["time_limit"] == 80 and row["restart_probability"] == 0.02
     assert row["robot_seconds"] == 50.0  # 1000 steps at 20 Hz
     learner.env = gym.make("kreps/SwingUp-v0")

@@ -156,6 +156,7 @@ def curve(length: float, **limit: str) -> Any:
             "terminated": "0.0",
             "time_limit": "nan",
             "robot_seconds": "nan",
+            "policy_kl": "nan",
             "kl": "0.5",
             "kl_bound": "1.0",
             "effective_samples": "20",

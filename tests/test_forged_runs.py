@@ -67,7 +67,7 @@ POSITIVE = ["kl_bound", "eta", "effective_samples", "ridge"]
 NOT_NEGATIVE = [
     *("jitter", "eta_floor", "policy_noise", "model_error", "newton_iterations"),
     *("dynamics_error", "worst_dynamics_error", "worst_coordinate"),
-    *("termination_error", "reward_error", "robot_seconds"),
+    *("termination_error", "reward_error", "robot_seconds", "policy_kl"),
     *(name for name in COLUMNS if name.startswith("cpu_seconds")),
 ]
 SHARES = ["clipped", "exploring", "rejected", "terminated", "explorer_share"]

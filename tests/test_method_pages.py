@@ -232,7 +232,7 @@ def test_the_table_of_parameters_agrees_with_the_settings(page: Path) -> None:
         assert f'`{name}="{value}"`' in text
 
 
-@pytest.mark.parametrize("preset", ["single_step", "paper"])
+@pytest.mark.parametrize("preset", ["single_step", "paper", "authors"])
 def test_the_page_has_the_settings_that_a_preset_changes(preset: str) -> None:
     (sentence,) = re.findall(
         rf'^`preset="{preset}"` changes (.+?);', KERNEL_PAGE, re.MULTILINE | re.DOTALL

@@ -345,7 +345,6 @@ def test_a_setting_of_another_method_is_unknown() -> None:
     for method, name in (
         ("value-iteration", "kl_bound"),
         ("grid-value-iteration", "initial_rollouts"),
-        ("grid-value-iteration", "temperature"),
         ("npalp", "actions"),
         ("reps", "lipschitz"),
     ):

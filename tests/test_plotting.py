@@ -54,6 +54,7 @@ def rows(count: int) -> list[dict[str, str]]:
             "terminated": "0.0",
             "time_limit": "nan",
             "robot_seconds": "nan",
+            "policy_kl": "nan",
         }
         for i in range(count)
     ]

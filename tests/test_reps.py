@@ -336,7 +336,7 @@ def test_rollouts_of_another_width_are_an_error(ds: int, da: int) -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-8, 1e8])
-@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper"])
+@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper", "authors"])
 def test_v_scales_with_the_reward_and_the_weights_do_not(preset: str, scale: float) -> None:
     rollouts = collect()
     settings = settings_of(preset)
@@ -357,7 +357,7 @@ def test_a_constant_added_to_the_reward_changes_nothing() -> None:
     np.testing.assert_allclose(moved.dual.weights, info.dual.weights, atol=1e-8)
 
 
-@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper"])
+@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper", "authors"])
 def test_equal_rewards_give_a_usable_policy(preset: str) -> None:
     settings = settings_of(preset)
     state, info = run(with_rewards(collect(), lambda r: np.full_like(r, -3.0)), settings)
@@ -402,7 +402,7 @@ def test_a_single_distinct_state_gives_a_usable_policy(preset: str) -> None:
     assert_usable(state)
 
 
-@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper"])
+@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper", "authors"])
 def test_a_single_distinct_action_is_learnt(preset: str) -> None:
     same = [replace(r, actions=np.full_like(r.actions, 0.5)) for r in collect()]
     settings = settings_of(preset)
@@ -421,7 +421,7 @@ def test_a_single_distinct_action_is_learnt(preset: str) -> None:
     np.testing.assert_allclose(state.policy.mean(near), 0.5, atol=0.1)
 
 
-@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper"])
+@pytest.mark.parametrize("preset", ["model_based", "single_step", "paper", "authors"])
 def test_a_single_step_gives_a_usable_policy(preset: str) -> None:
     one = [Rollout(np.array([[0.0, 0.0], [0.1, 0.3]]), np.array([[1.0]]), np.array([-1.0]))]
     settings = settings_of(preset)

@@ -11,7 +11,7 @@ import pytest
 
 import kreps
 from kreps.errors import ConfigurationError
-from kreps.presets import PRESETS, changed, flat, settings_of
+from kreps.presets import PRESETS, changed, flat, preset_of, settings_of
 from kreps.settings import (
     RKHS,
     Exploration,
@@ -45,6 +45,7 @@ MODEL_BASED: dict[str, Any] = {
     "exploring_starts": 0.25,
     "model": "dynamics",
     "policy_fit": "map",
+    "cross_validation": "samples",
     "value": "rkhs",
     "value.max_rank": 400,
     "value.tolerance": 1e-6,
@@ -82,11 +83,28 @@ PAPER: dict[str, Any] = {
     "model": "embedding",
     "policy_fit": "bounded",
 }
+AUTHORS: dict[str, Any] = {
+    **{name: v for name, v in SINGLE_STEP.items() if not name.startswith("low_rank.")},
+    "exploration.noise": "gaussian",
+    "kl_bound": 0.5,
+    "eta_floor": 0.0,
+    "ridge": 1e-6,
+    "model": "embedding",
+    "policy_fit": "free",
+    "cross_validation": "rollouts",
+    "value.max_rank": 3000,
+    "low_rank": None,
+}
 
 
 @pytest.mark.parametrize(
     ("preset", "values"),
-    [("model_based", MODEL_BASED), ("single_step", SINGLE_STEP), ("paper", PAPER)],
+    [
+        ("model_based", MODEL_BASED),
+        ("single_step", SINGLE_STEP),
+        ("paper", PAPER),
+        ("authors", AUTHORS),
+    ],
 )
 def test_presets_have_these_values(preset: str, values: dict[str, Any]) -> None:
     assert flat(settings_of(preset)) == values
@@ -108,10 +126,17 @@ def test_other_learners_have_these_defaults() -> None:
         "growth": 0.0,
         "rollout_lengths": "independent",
     }
-    assert flat(ValueIterationSettings()) == {**on_policy, "temperature": 1.0, "actions": 25}
+    values = {"temperature_unit": "reward", "known_reward": False, "cross_validation": "samples"}
+    assert flat(ValueIterationSettings()) == {
+        **on_policy,
+        "temperature": 1.0,
+        "actions": 25,
+        **values,
+    }
     assert flat(NPALPSettings()) == {
         **on_policy,
         "lipschitz": 10.0,
+        "lipschitz_unit": "standardised",
         "noise_fraction": 0.3,
         "noise_scale": 0.3,
     }
@@ -122,11 +147,57 @@ def test_other_learners_have_these_defaults() -> None:
         "actions": 25,
         "grid_states": 15,
         "grid_actions": 7,
+        "temperature": 0.0,
+        **values,
     }
 
 
+def test_the_presets_of_the_other_learners_are_these() -> None:
+    values = {"temperature_unit": "q", "known_reward": True, "cross_validation": "rollouts"}
+    first = {"exploration.noise": "gaussian"}
+    changed_by: dict[type[Any], dict[str, Any]] = {
+        ValueIterationSettings: {**first, "temperature": 1.0 / 3.0, **values},
+        GridValueIterationSettings: {
+            "grid_states": (19, 11),
+            "grid_actions": 11,
+            "temperature": 0.05,
+            **values,
+        },
+        NPALPSettings: {
+            **first,
+            "lipschitz": 1.0,
+            "lipschitz_unit": "raw",
+            "noise_fraction": 0.1,
+            "noise_scale": 0.6,
+        },
+    }
+    for kind, changes in changed_by.items():
+        assert flat(preset_of(kind, "default", {})) == flat(kind())
+        assert flat(preset_of(kind, "authors", {})) == {**flat(kind()), **changes}
+        with pytest.raises(ConfigurationError, match=rf"'default', 'authors', .*{kind.__name__}"):
+            preset_of(kind, "paper", {})
+    assert kreps.NPALP(kreps.TaskSpec(1, [-1.0], [1.0]), preset="authors").settings.lipschitz == 1.0
+
+
+@pytest.mark.parametrize("kind", [ValueIterationSettings, GridValueIterationSettings])
+def test_a_known_reward_is_of_the_authors_value_iteration(kind: Any) -> None:
+    with pytest.raises(ConfigurationError, match=r'known_reward = True.*preset="authors"'):
+        kind(known_reward=True)
+    with pytest.raises(ConfigurationError, match=r"known_reward = 1,.*True or False"):
+        kind(known_reward=1, temperature_unit="q", temperature=1.0)
+    with pytest.raises(ConfigurationError, match="temperature = 0"):
+        kind(temperature=0.0, temperature_unit="q")
+
+
+def test_a_grid_may_have_a_size_for_each_coordinate() -> None:
+    assert GridValueIterationSettings(grid_states=[3, 4]).grid_states == (3, 4)  # type: ignore[arg-type]
+    for wrong in ((), (3, 0), (3, 2.0), (True, 2)):
+        with pytest.raises(ConfigurationError, match=r"grid_states = .*whole numbers"):
+            GridValueIterationSettings(grid_states=wrong)  # type: ignore[arg-type]
+
+
 def test_an_unknown_preset_is_refused_with_the_choices() -> None:
-    choices = r"'model_based', 'single_step', 'paper'"
+    choices = r"'model_based', 'single_step', 'paper', 'authors'"
     with pytest.raises(ConfigurationError, match=rf"'papre' is unknown; .*{choices}"):
         settings_of("papre")
     with pytest.raises(ConfigurationError, match=r"called 'single_step' now"):
@@ -339,6 +410,7 @@ OUT_OF_RANGE: dict[str, list[Any]] = {
     "exploring_starts": [-0.1, 1.1, *NOT_FINITE, *NO_NUMBERS],
     "model": ["exact", "", None, ["change"]],
     "policy_fit": ["mle", "", None],
+    "cross_validation": ["loo", "", None],
     "value.max_rank": NO_COUNTS,
     "value.tolerance": [0.0, -1.0, *NOT_FINITE, *NO_NUMBERS],
     "value.angle_wrap": ["cut", "round", "", None],
@@ -448,7 +520,8 @@ AT_THE_EDGE: dict[str, list[Any]] = {
     "ridge": [None, 1e-9],
     "exploring_starts": [0, 0.0, 1.0],
     "model": ["change", "embedding"],
-    "policy_fit": ["bounded"],
+    "policy_fit": ["bounded", "free"],
+    "cross_validation": ["samples"],
     "value.max_rank": [1],
     "low_rank.above": [0],
     "model_based.actions_per_state": [1],

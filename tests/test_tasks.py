@@ -23,7 +23,13 @@ from kreps.learning.environment import batch_model_of, task_of
 from kreps.learning.evaluate import evaluate
 from kreps.policies.exploration import Gaussian
 
-NAMES = ["kreps/Reaching-v0", "kreps/ImageSwingUp-v0"]
+NAMES = [
+    "kreps/Reaching-v0",
+    "kreps/ImageSwingUp-v0",
+    "kreps/AuthorsSwingUp-v0",
+    "kreps/AuthorsReaching-v0",
+    "kreps/AuthorsImageSwingUp-v0",
+]
 TINY = {"initial_rollouts": 6, "rollouts_per_iteration": 3, "window": 6}
 
 

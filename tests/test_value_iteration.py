@@ -289,7 +289,7 @@ def test_a_fit_starts_where_that_of_the_last_update_ended() -> None:
     ("change", "note"), [(0.0, ""), (1e-3, ""), (1.1e-3, "NOT CONVERGED"), (1.0, "NOT CONVERGED")]
 )
 def test_a_change_above_the_tolerance_is_shown_as_not_converged(change: float, note: str) -> None:
-    info = ValueIterationInfo(20, 300, change, np.ones(4), {})
+    info = ValueIterationInfo(20, 300, change, 1e-3, np.ones(4), {})
     assert info.shown()["note"] == note
     assert info.converged == (note == "")
 

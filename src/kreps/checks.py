@@ -39,6 +39,22 @@ class Checked:
         for name in names:
             self._check(name, Real, "positive and finite", lambda v: 0 < v < inf)
 
+    def _flag(self, name: str) -> None:
+        if not isinstance(getattr(self, name), bool):
+            raise ConfigurationError(
+                f"{name} = {shown(getattr(self, name))}, but it must be True or False"
+            )
+
+    def _counts(self, name: str, largest: int) -> None:
+        """Accept a sequence of whole numbers, and store it as a tuple."""
+        values = tuple(getattr(self, name))
+        if not values or not all(type(v) is int and 1 <= v <= largest for v in values):
+            raise ConfigurationError(
+                f"{name} = {shown(values)}, but it must be whole numbers from 1 to {largest}, one "
+                "for each coordinate"
+            )
+        object.__setattr__(self, name, values)
+
     def _whole(self, *names: str, largest: int = MAX_WHOLE_NUMBER) -> None:
         for name in names:
             limit = f"a whole number from 1 to {largest}"

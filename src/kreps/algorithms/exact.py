@@ -22,6 +22,7 @@ from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis
 from kreps.kernels.kernel import Kernel
+from kreps.kernels.regression import KernelEmbedding
 from kreps.models.dynamics import (
     expected_features_of_samples,
     fit_dynamics,
@@ -137,7 +138,7 @@ class ExactBatch:
         if model == "sample":
             self.clock.lap("embedding fit")
             return Expectation(origin + targets, None, None, None, None, terminated, None)
-        embedding, x = fit_embedding(data, targets, kernel, self.task, start, rng)
+        embedding, x = self._fitted_embedding(features, targets, kernel, start, rng)
         self.jitters.append(embedding.factor.jitter)
         self.clock.lap("embedding fit")
         predict = embedding.predictor(targets)
@@ -150,6 +151,16 @@ class ExactBatch:
             terminated,
             as_probabilities(embedding.predictor(terminated[:, None])) if self.end else None,
         )
+
+    def _fitted_embedding(
+        self,
+        features: ValueFeatures,
+        targets: FloatArray,
+        kernel: Kernel,
+        start: FloatArray | None,
+        rng: np.random.Generator,
+    ) -> tuple[KernelEmbedding, FloatArray]:
+        return fit_embedding(self.data, targets, kernel, self.task, start, rng)
 
     def solve_dual(
         self, features: ValueFeatures, model: Expectation, eta_floor: float
@@ -182,6 +193,12 @@ class ExactBatch:
     ) -> PolicyFit:
         targets = targets.top_by_weight(MAX_SUPPORT)
         x = policy_hyperparameters(targets, kernel, self.settings.policy_fit, start, rng)
+        return self._policy_with(x, targets, kernel, std_scale)
+
+    def _policy_with(
+        self, x: FloatArray, targets: PolicyTargets, kernel: Kernel, std_scale: float = 1.0
+    ) -> PolicyFit:
+        """The policy with log hyper-parameters x (g + 2,)."""
         self.clock.lap("policy fit")
         weights, noise = exploration_noise(targets, float(np.exp(x[-1])))
         policy = CostSensitiveGP(

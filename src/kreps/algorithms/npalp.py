@@ -93,17 +93,21 @@ def update(
     data = exact_transitions(window)
     clock = Stopwatch()
     kernel = state_kernel(data, task, rng)
+    rewards, unit = standardise(data.rewards)
+    lipschitz = settings.lipschitz
+    if settings.lipschitz_unit == "raw":
+        kernel = kernel.with_lengthscales(np.ones(len(kernel.factors)))
+        lipschitz /= unit
     points = kernel.embed(data.points)
     distances = cdist(points, points[data.state])
     clock.lap("distances")
-    rewards, unit = standardise(data.rewards)
     gamma = 1.0 - settings.p
     # V after a termination: reward zero, standardised, in each step
     after_end = -float(data.rewards.max()) / unit / (1.0 - gamma)
     bounds, improvements, residual = sample_bounds(
         rewards + np.where(data.terminated, gamma * after_end, 0.0),
         np.where(data.terminated, 0.0, gamma),
-        settings.lipschitz * distances[data.successor],
+        lipschitz * distances[data.successor],
     )
     clock.lap("fixed point")
     policy = LipschitzPolicy(
@@ -112,7 +116,7 @@ def update(
         data.states,
         task.clip(data.actions),
         unit * bounds + float(data.rewards.max()) / settings.p,
-        unit * settings.lipschitz,
+        unit * lipschitz,
         settings.noise_fraction,
         settings.noise_scale,
     )

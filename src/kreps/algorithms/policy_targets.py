@@ -165,8 +165,8 @@ def policy_hyperparameters(
         targets: those that the policy is fitted to, or a subsample of them.
         state_kernel: its factors are those of the policy's kernel; its lengthscales are the median
             distances.
-        policy_fit: ``"map"``, with Gaussian priors around the median distances; or ``"bounded"``,
-            within hard ranges.
+        policy_fit: ``"map"``, with Gaussian priors around the median distances; ``"bounded"``,
+            within hard ranges; or ``"free"``, with neither.
         start: log hyper-parameters (g + 2,) from which the fit starts; None for the prior's centre.
         rng: draws the samples of the fit.
     """
@@ -195,7 +195,7 @@ def policy_prior(targets: PolicyTargets, state_kernel: Kernel, policy_fit: str) 
     log_variance = np.log(max(variance, MIN_TARGET_VARIANCE))
     variances = [log_variance + LOG_SIGNAL_CENTRE, log_variance + LOG_NOISE_CENTRE]
     centre = np.concatenate([median + LOG_LENGTHSCALE_CENTRE, variances])
-    if policy_fit == "map":
+    if policy_fit in ("map", "free"):
         shortest, longest = LOG_LENGTHSCALE_RANGE
         smallest, largest = np.log([[bound] * 2 for bound in VARIANCE_RANGE])
         return Prior(
@@ -203,7 +203,8 @@ def policy_prior(targets: PolicyTargets, state_kernel: Kernel, policy_fit: str) 
             std=np.concatenate([np.full(g, LOG_LENGTHSCALE_STD), [LOG_VARIANCE_STD] * 2]),
             low=np.concatenate([median + shortest, smallest]),
             high=np.concatenate([median + longest, largest]),
-            strength=1.0 / targets.total_weight,  # the loss is per unit of weight
+            # the loss is per unit of weight
+            strength=1.0 / targets.total_weight if policy_fit == "map" else 0.0,
         )
     low, high = np.log([BOUNDED_SIGNAL, BOUNDED_NOISE]).T
     shortest, longest = np.log(BOUNDED_LENGTHSCALES)

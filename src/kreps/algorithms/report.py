@@ -37,6 +37,8 @@ class UpdateInfo:
             the square of the factor.
         noise: variance of the exploration noise of the fitted policy, in units of the action scale
             squared.
+        policy_kl: mean KL divergence, in nats, of the fitted policy from the previous one over
+            sampled states; NaN without one.  The bound is on the KL of the weights, ``dual.kl``.
         rejected: whether the fitted policy failed the acceptance test, so that the previous one
             acts; None without a test.
         jitter: largest jitter of a factorisation of this update, except those at trial points of
@@ -61,6 +63,7 @@ class UpdateInfo:
     embedding_parameters: FloatArray | None
     policy_parameters: FloatArray
     noise: float
+    policy_kl: float
     rejected: bool | None
     jitter: float
     history_choice: HistoryChoice | None

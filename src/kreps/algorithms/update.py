@@ -16,8 +16,10 @@ from kreps.algorithms.model_based import (
     has_acceptance_test,
     model_based_step,
 )
+from kreps.algorithms.policy_divergence import expected_policy_kl
 from kreps.algorithms.report import UpdateInfo
 from kreps.algorithms.reps import Batch, Step, reps_step, stationarity_ridge
+from kreps.algorithms.rollout_folds import RolloutFolds
 from kreps.algorithms.state import LearnerState, Stopwatch
 from kreps.data.compute import CHUNK_SIZE, Compute
 from kreps.data.dataset import Dataset
@@ -25,7 +27,8 @@ from kreps.data.rollouts import Rollout
 from kreps.errors import ConfigurationError
 from kreps.models.history_choice import HistoryChoice, choose_history
 from kreps.models.model_errors import model_errors
-from kreps.settings import Settings
+from kreps.policies.base import LearntPolicy
+from kreps.settings import Grid, Settings
 
 
 def update(
@@ -64,7 +67,7 @@ def update(
         reward_start=reward_start,
         policy_start=step.policy.x,
     )
-    return new_state, report(batch, step, rejected, choice)
+    return new_state, report(batch, step, state.policy, rejected, choice)
 
 
 def history_choice(
@@ -103,18 +106,25 @@ def batch_of(
             )
         return LowRankBatch(state.window, samples, settings, low_rank, clock, compute, rng)
     window = state.append(samples)
+    if settings.cross_validation == "rollouts":
+        return RolloutFolds(window, samples, settings, clock)
     if low_rank is None or window.steps <= low_rank.above:
         return ExactBatch(window, samples, settings, clock)
     return LowRankBatch(window, samples, settings, low_rank, clock, compute, rng)
 
 
 def report(
-    batch: Batch[Any, Any], step: Step, rejected: bool | None, choice: HistoryChoice | None
+    batch: Batch[Any, Any],
+    step: Step,
+    previous: LearntPolicy | None,
+    rejected: bool | None,
+    choice: HistoryChoice | None,
 ) -> UpdateInfo:
-    """What is only reported of an update."""
+    """What is only reported of an update, with the policy before it."""
     errors, actions, task = step.model.errors, batch.actions, batch.task
     beyond = (actions < task.action_low) | (actions > task.action_high)
-    parameters = step.model.parameters
+    parameters, basis = step.model.parameters, step.features.basis
+    kernel = step.kernel if isinstance(batch.settings.value, Grid) else basis.kernel
     return UpdateInfo(
         samples=batch.size,
         kl_bound=batch.settings.kl_bound,
@@ -124,14 +134,15 @@ def report(
         held_out=model_errors(batch.data, task, step.model.dynamics, step.reward_model),
         clipped=float(np.mean(beyond)),
         rank=step.problem.rank,
-        rank_residual=step.features.basis.residual,
+        rank_residual=basis.residual,
         dual=step.dual,
         effective_samples=effective_sample_size(step.dual.weights),
         support=step.policy.support,
-        state_lengthscales=step.kernel.lengthscales,
+        state_lengthscales=kernel.lengthscales[: len(step.kernel.factors)],
         embedding_parameters=None if parameters is None else np.exp(parameters),
         policy_parameters=np.exp(step.policy.x),
         noise=step.policy.noise,
+        policy_kl=expected_policy_kl(step.policy.policy, previous, batch.data),
         rejected=rejected,
         jitter=max([step.dual.jitter, *batch.jitters]),
         history_choice=choice,

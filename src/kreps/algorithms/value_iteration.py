@@ -13,6 +13,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from kreps.algorithms.dual import standardise
+from kreps.algorithms.hard_value_iteration import (
+    RELATIVE_TOLERANCE,
+    QFunction,
+    RewardFunction,
+    iterate_to_one_percent,
+    known_rewards,
+    relative_policy,
+)
 from kreps.algorithms.state import LearnerState, Stopwatch, exact_transitions
 from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
@@ -20,6 +28,7 @@ from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import FloatArray, grid_points
 from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.regression import KernelEmbedding
+from kreps.models.rollout_folds import fit_embedding_by_folds, fitted_state_kernel
 from kreps.models.transition import fit_embedding, state_kernel, successor_features
 from kreps.policies.value_based import SoftmaxPolicy, soft_maximum
 from kreps.settings import RKHS, GridValueIterationSettings, ValueIterationSettings
@@ -42,7 +51,9 @@ class ValueIterationInfo:
     Attributes:
         samples: n.
         sweeps: number of sweeps.
-        change: range of the change of V in the last sweep, in standard deviations of the reward.
+        change: of V in the last sweep: its range, in standard deviations of the reward; or, of the
+            authors' value iteration, its norm as a share of that of V.
+        tolerance: largest change that ends the sweeps.
         embedding_parameters: (g + da + 1,) fitted lengthscales and lambda.
         seconds: CPU seconds by stage.
     """
@@ -50,13 +61,14 @@ class ValueIterationInfo:
     samples: int
     sweeps: int
     change: float
+    tolerance: float
     embedding_parameters: FloatArray
     seconds: dict[str, float]
 
     @property
     def converged(self) -> bool:
-        """Whether V is a fixed point to `CHANGE_TOLERANCE`."""
-        return self.change <= CHANGE_TOLERANCE
+        """Whether V has settled to the tolerance."""
+        return self.change <= self.tolerance
 
     def numbers(self) -> dict[str, float]:
         """The diagnostics of the method, by name."""
@@ -77,6 +89,7 @@ def update(
     task: TaskSpec,
     settings: ValueIterationSettings | GridValueIterationSettings,
     rng: np.random.Generator,
+    known_reward: RewardFunction | None = None,
 ) -> tuple[LearnerState, ValueIterationInfo]:
     """A policy from all transitions of the replay window, new rollouts included.
 
@@ -86,44 +99,76 @@ def update(
         task: limits and scale of the actions, and which coordinates are angles.
         settings: of the method.
         rng: draws the samples of the fits.
+        known_reward: the reward function, if it is not learnt.
 
     Raises:
         DataError: no rollout at all, or one of another width than the task's.
-        ConfigurationError: more samples than an exact update can take, or too few candidate
-            actions.
+        ConfigurationError: more samples than an exact update can take, too few candidate actions,
+            or a known reward in which state and action are not separate.
     """
     window = state.append(rollouts)
     data = exact_transitions(window)
     clock = Stopwatch()
+    rewards, unit = standardise(data.rewards)
+    model, start = _embedding(data, rewards, task, settings, state, clock, rng)
+    candidates = candidate_actions(task, settings.actions)
+    gamma = 1.0 - settings.p
+    policy: SoftmaxPolicy
+    if settings.temperature_unit == "q":
+        known = None
+        if known_reward is not None:
+            known = known_rewards(known_reward, data.points, task.unscaled(candidates))
+        q = iterate_to_one_percent(model, data, known, candidates, gamma)
+        policy = relative_policy(model, data, task, q, known, candidates, settings.temperature)
+        tolerance = RELATIVE_TOLERANCE
+    else:
+        no_reward = -float(data.rewards.max()) / unit  # reward zero, standardised
+        q = iterate_values(model, data, rewards, no_reward, candidates, settings.temperature, gamma)
+        policy = SoftmaxPolicy(
+            task,
+            model.kernel.part(slice(-task.action_size)),
+            data.states,
+            unit * q.table,
+            unit * q.offset + float(data.rewards.max()) / settings.p,
+            candidates,
+            unit * settings.temperature,
+        )
+        tolerance = CHANGE_TOLERANCE
+    clock.lap("sweeps")
+    new_state = state.after(
+        len(rollouts), sum(map(len, rollouts)), window, policy=policy, embedding_start=start
+    )
+    info = ValueIterationInfo(
+        len(data), q.sweeps, q.change, tolerance, np.exp(start), clock.seconds
+    )
+    return new_state, info
+
+
+def _embedding(
+    data: Transitions,
+    rewards: FloatArray,
+    task: TaskSpec,
+    settings: ValueIterationSettings | GridValueIterationSettings,
+    state: LearnerState,
+    clock: Stopwatch,
+    rng: np.random.Generator,
+) -> tuple[KernelEmbedding, FloatArray]:
+    """The embedding and its log hyper-parameters (g + da + 1,)."""
+    folds = settings.cross_validation == "rollouts"
     kernel = state_kernel(data, task, rng)
+    if folds:
+        kernel = fitted_state_kernel(data, rewards, kernel, settings.p)
     _, features = RKHSBasis.fit(
         kernel, data.points, tolerance=BASIS.tolerance, max_rank=BASIS.max_rank
     )
     clock.lap("basis")
-    model, start = fit_embedding(
-        data, successor_features(data, features), kernel, task, state.embedding_start, rng
-    )
+    targets = successor_features(data, features)
+    if folds:
+        found = fit_embedding_by_folds(data, targets, kernel, task)
+    else:
+        found = fit_embedding(data, targets, kernel, task, state.embedding_start, rng)
     clock.lap("embedding")
-    rewards, unit = standardise(data.rewards)
-    candidates = candidate_actions(task, settings.actions)
-    gamma = 1.0 - settings.p
-    no_reward = -float(data.rewards.max()) / unit  # reward zero, standardised
-    q = iterate_values(model, data, rewards, no_reward, candidates, settings.temperature, gamma)
-    clock.lap("sweeps")
-    policy = SoftmaxPolicy(
-        task,
-        model.kernel.part(slice(-task.action_size)),
-        data.states,
-        unit * q.table,
-        unit * q.offset + float(data.rewards.max()) / settings.p,
-        candidates,
-        unit * settings.temperature,
-    )
-    new_state = state.after(
-        len(rollouts), sum(map(len, rollouts)), window, policy=policy, embedding_start=start
-    )
-    info = ValueIterationInfo(len(data), q.sweeps, q.change, np.exp(start), clock.seconds)
-    return new_state, info
+    return found
 
 
 def candidate_actions(task: TaskSpec, count: int) -> FloatArray:
@@ -140,23 +185,6 @@ def candidate_actions(task: TaskSpec, count: int) -> FloatArray:
             "no grid"
         )
     return grid_points([np.linspace(-1.0, 1.0, levels)] * task.action_size)
-
-
-@dataclass(frozen=True)
-class QFunction:
-    """``Q(s, a_k) = offset + sum_i k_s(s_i, s) table_ik``.
-
-    Attributes:
-        table: (n, k) of samples and candidate actions.
-        offset: value far from the data.
-        sweeps: number of sweeps.
-        change: range of the change of V in the last sweep.
-    """
-
-    table: FloatArray
-    offset: float
-    sweeps: int
-    change: float
 
 
 def iterate_values(

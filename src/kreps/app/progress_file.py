@@ -1,17 +1,17 @@
 """``progress.csv``: one row of numbers per iteration of a run.
 
 eta, its floor, dual, primal and gap are in standard deviations of the reward.  ``weighted`` is the
-number of samples with a weight in the last step of an update, generated ones included.
-``policy_noise`` is the policy's standard deviation near its data, in units of half the action
-range.  The quartiles are those of the new rollouts' mean rewards per step, each counted by its
-steps.  Steps and rewards per step are those of the environment; the restart probability is that at
-each decision, and ``action_repeat`` the steps for which one is held.  ``robot_seconds`` are the
-steps so far times the control period, without resets.  ``mean_return`` is the mean
-sum of the rewards of a new rollout, which a random restart may have cut, ``terminated`` the share
-of the new rollouts that ended by a termination.  These
-numbers are of the acting policy's rollouts; ``explorer_share`` is the share of the steps that the
-explorer made.  The errors of dynamics, terminations and reward are those of
-`kreps.models.model_errors`.
+number of samples with a weight in the last step of an update, generated ones included.  ``kl`` is
+that of these weights, ``policy_kl`` the mean divergence of the fitted policy from the previous one
+over sampled states, both in nats.  ``policy_noise`` is the policy's standard deviation near its
+data, in units of half the action range.  The quartiles are those of the new rollouts' mean rewards
+per step, each counted by its steps.  Steps and rewards per step are those of the environment; the
+restart probability is that at each decision, and ``action_repeat`` the steps for which one is held.
+``robot_seconds`` are the steps so far times the control period, without resets.  ``mean_return`` is
+the mean sum of the rewards of a new rollout, which a random restart may have cut, ``terminated``
+the share of the new rollouts that ended by a termination.  These numbers are of the acting policy's
+rollouts; ``explorer_share`` is the share of the steps that the explorer made.  The errors of
+dynamics, terminations and reward are those of `kreps.models.model_errors`.
 """
 
 from __future__ import annotations
@@ -74,12 +74,14 @@ ADDED_COLUMNS = (
     "action_repeat",
     "explorer_share",
     "robot_seconds",
+    "policy_kl",
 )
 """Columns that runs of earlier versions lack, in the order in which they were added.
 
 A missing one is read as NaN.  Present ones may be NaN: the errors without such a model,
 ``max_rank`` with a fixed number of features of V, ``rejected`` without an acceptance test,
-``time_limit`` of an environment that has none, ``robot_seconds`` without a known control period.
+``time_limit`` of an environment that has none, ``robot_seconds`` without a known control period,
+``policy_kl`` without a previous policy.
 """
 
 
@@ -129,6 +131,7 @@ RANGES = {
     **dict.fromkeys(("jitter", "eta_floor", "policy_noise", "model_error"), NOT_NEGATIVE),
     **dict.fromkeys(("dynamics_error", "worst_dynamics_error"), NOT_NEGATIVE),
     **dict.fromkeys(("termination_error", "reward_error", "robot_seconds"), NOT_NEGATIVE),
+    "policy_kl": NOT_NEGATIVE,
     **dict.fromkeys(map(seconds_column, STAGES), NOT_NEGATIVE),
     **dict.fromkeys(("clipped", "exploring", "rejected", "terminated", "explorer_share"), SHARE),
     "restart_probability": SHARE,
@@ -261,5 +264,6 @@ def progress_row(learner: KREPS, report: IterationReport) -> dict[str, Any]:
         "restart_probability": report.restart_probability,
         "action_repeat": learner.task.action_repeat,
         "robot_seconds": round(_or_nan(learner.task.robot_seconds(report.steps)), 6),
+        "policy_kl": info.policy_kl,
         **{seconds_column(stage): round(seconds.get(stage, 0.0), 5) for stage in STAGES},
     }

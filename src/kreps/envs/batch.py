@@ -44,6 +44,14 @@ class SettableModel(BatchModel, Protocol):
         ...
 
 
+class KnownReward(BatchModel, Protocol):
+    """A batch model whose reward is a known function of observation and action."""
+
+    def rewards(self, observations: FloatArray, actions: FloatArray) -> FloatArray:
+        """Rewards (m,) of actions (m, da) taken at observations (m, ds)."""
+        ...
+
+
 def time_stamps_of(model: BatchModel, states: FloatArray) -> FloatArray | None:
     """Time stamps (m,) in s since the start of states (m, k), by ``model.time_stamps(states)``.
 

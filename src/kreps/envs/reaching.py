@@ -89,6 +89,9 @@ class ReachingBatch:
         start = np.zeros((len(observations), 1 if self.jitter else 0))
         return wrap_angles(np.concatenate([observations, start], axis=1))
 
+    def rewards(self, observations: FloatArray, actions: FloatArray) -> FloatArray:
+        return reward(observations, np.clip(actions, -MAX_TORQUE, MAX_TORQUE))
+
     def step(
         self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
@@ -98,7 +101,7 @@ class ReachingBatch:
             return np.concatenate([s[:, 2:], accelerations(s, torques)], axis=1)
 
         moving = states[:, :4]
-        rewards, ends = reward(moving, torques), np.zeros(len(rngs), dtype=bool)
+        rewards, ends = self.rewards(moving, actions), np.zeros(len(rngs), dtype=bool)
         if not self.jitter:
             return wrap_angles(runge_kutta(derivative, moving, TIME_STEP, SUB_STEPS)), rewards, ends
         periods = control_periods(TIME_STEP, self.jitter, rngs)[:, None]

@@ -8,6 +8,9 @@ ENVIRONMENTS = {
     "kreps/SwingUp-v0": "kreps.envs.swing_up:SwingUp",
     "kreps/Reaching-v0": "kreps.envs.reaching:Reaching",
     "kreps/ImageSwingUp-v0": "kreps.envs.image_swing_up:ImageSwingUp",
+    "kreps/AuthorsSwingUp-v0": "kreps.envs.authors.swing_up:AuthorsSwingUp",
+    "kreps/AuthorsReaching-v0": "kreps.envs.authors.reaching:AuthorsReaching",
+    "kreps/AuthorsImageSwingUp-v0": "kreps.envs.authors.image_swing_up:AuthorsImageSwingUp",
 }
 
 

@@ -124,13 +124,17 @@ class SwingUpBatch:
         columns = [wrap_angle(observations[:, 0]), observations[:, 1]]
         return np.stack([*columns, 0.0 * columns[1]] if self.jitter else columns, axis=1)
 
+    def rewards(self, observations: FloatArray, actions: FloatArray) -> FloatArray:
+        torque = np.clip(actions[:, 0], -MAX_TORQUE, MAX_TORQUE)
+        return reward(observations[:, 0], observations[:, 1], torque)
+
     def step(
         self, states: FloatArray, actions: FloatArray, rngs: Sequence[np.random.Generator]
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         theta, velocity = states.T[:2]
         torque = np.clip(actions[:, 0], -MAX_TORQUE, MAX_TORQUE)
         noise = NOISE * np.array([rng.standard_normal() for rng in rngs])
-        rewards = reward(theta, velocity, torque)
+        rewards = self.rewards(states, actions)
         period: float | FloatArray = TIME_STEP
         if self.jitter:
             period = control_periods(TIME_STEP, self.jitter, rngs)

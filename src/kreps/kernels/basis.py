@@ -27,6 +27,11 @@ class Basis(Protocol):
     """Features of the value function, or of any other function of the same inputs."""
 
     @property
+    def kernel(self) -> Kernel:
+        """Whose functions the features are, or span."""
+        ...
+
+    @property
     def residual(self) -> float:
         """Largest squared residual of a sampled state's kernel function; 0 for fixed features."""
         ...

@@ -6,6 +6,7 @@ Each is minimised over log parameters on a subsample of the data (`kreps.kernels
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,6 +30,9 @@ that one which stops here is continued by the next update."""
 
 REJECTED_LOSS = 1e10
 """Loss of parameters whose matrix cannot be factorised; it makes the line search step back."""
+
+Loss = Callable[[FloatArray], tuple[float, FloatArray]]
+"""Value and gradient (k,) at parameters (k,)."""
 
 MIN_SQUARED_ERROR = 1e-200
 """Smallest mean squared error whose logarithm is taken: that of targets which are all zero."""
@@ -176,7 +180,7 @@ def factor_distances(factors: tuple[Factor, ...], x: FloatArray) -> FloatArray:
 
 
 def minimise(
-    loss: EmbeddingLoss | PolicyLoss,
+    loss: Loss,
     prior: Prior,
     *starts: FloatArray,
     max_iterations: int = MAX_ITERATIONS,

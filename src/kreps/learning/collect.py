@@ -6,6 +6,7 @@ same data from the same seed.
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -106,7 +107,7 @@ def collect_grid(
     env: Environment,
     task: TaskSpec,
     ranges: Sequence[tuple[float, float]] | None,
-    grid_states: int,
+    grid_states: int | Sequence[int],
     grid_actions: int,
     *,
     max_points: int,
@@ -120,7 +121,7 @@ def collect_grid(
         task: of the environment.
         ranges: smallest and largest value of each observation coordinate; None takes those of the
             observation space.
-        grid_states, grid_actions: points per coordinate.  Angles are spaced over a whole turn.
+        grid_states, grid_actions: points per coordinate; of states one number, or one for each.
         max_points: largest number of grid points.
         seed, iteration: address the random numbers of the steps.
 
@@ -137,7 +138,13 @@ def collect_grid(
             "batch_model with states_at(observations); use kreps.ValueIteration, which collects "
             "rollouts from start states"
         )
-    count = grid_states**task.observation_size * grid_actions**task.action_size
+    sizes = [grid_states] * task.observation_size if isinstance(grid_states, int) else grid_states
+    if len(sizes) != task.observation_size:
+        raise ConfigurationError(
+            f"grid_states = {tuple(sizes)}, but the task has {task.observation_size} observation "
+            "coordinates; give one number for each"
+        )
+    count = math.prod(sizes) * grid_actions**task.action_size
     if count > max_points:
         raise ConfigurationError(
             f"a grid of {grid_states} points in each of {task.observation_size} state and "
@@ -146,7 +153,7 @@ def collect_grid(
             "allowed (by the window and the cost of an exact update); lower grid_states or "
             "grid_actions"
         )
-    axes = grid_axes(task, observation_limits(env, task, ranges), grid_states, grid_actions)
+    axes = grid_axes(task, observation_limits(env, task, ranges), sizes, grid_actions)
     states, actions = np.split(grid_points(axes), [task.observation_size], axis=1)
     rngs = [generator(seed, Purpose.ENVIRONMENT, iteration, j) for j in range(count)]
     try:
@@ -165,7 +172,7 @@ def collect_grid(
 def grid_axes(
     task: TaskSpec,
     limits: Sequence[tuple[float, float]],
-    grid_states: int,
+    grid_states: Sequence[int],
     grid_actions: int,
 ) -> list[FloatArray]:
     """The grid's values of each state and action coordinate, ``ds + da`` arrays.
@@ -173,12 +180,12 @@ def grid_axes(
     Args:
         task: limits of the actions, and which coordinates are angles.
         limits: smallest and largest value of each observation coordinate.
-        grid_states, grid_actions: points per coordinate.  Angles are spaced over a whole turn.
+        grid_states: points of each state coordinate.  Angles are spaced over a whole turn.
+        grid_actions: points of each action coordinate.
     """
-    turn = np.arange(grid_states) * 2.0 * np.pi / grid_states
     states = [
-        turn if i in task.periodic else np.linspace(low, high, grid_states)
-        for i, (low, high) in enumerate(limits)
+        np.arange(size) * 2.0 * np.pi / size if i in task.periodic else np.linspace(*limit, size)
+        for i, (limit, size) in enumerate(zip(limits, grid_states, strict=True))
     ]
     actions = [
         np.linspace(low, high, grid_actions)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any, cast
 
@@ -13,6 +13,7 @@ import numpy as np
 
 from kreps.data.spaces import Spaces
 from kreps.data.task import TaskSpec
+from kreps.envs.batch import KnownReward
 from kreps.envs.batch import batch_model_of as batch_model_of
 from kreps.errors import ConfigurationError, SpaceError
 from kreps.kernels.arrays import FloatArray
@@ -191,6 +192,21 @@ def environment_for(
         )
     warn_about_state(env)
     return inside
+
+
+def known_reward_of(env: Environment | None) -> Callable[[FloatArray, FloatArray], FloatArray]:
+    """The reward function of an environment: ``rewards`` of its batch model.
+
+    Raises:
+        ConfigurationError: no environment, or one whose reward function is not known.
+    """
+    model = None if env is None else batch_model_of(env)
+    if not hasattr(model, "rewards"):
+        raise ConfigurationError(
+            f"known_reward = True, but the reward function of {env} is not known: it has no "
+            "batch_model with rewards(observations, actions); set known_reward=False to learn it"
+        )
+    return cast(KnownReward, model).rewards
 
 
 def time_limit(env: Environment) -> int:

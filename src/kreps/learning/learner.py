@@ -31,7 +31,7 @@ from kreps.learning.environment import Environment, environment_for, task_of
 from kreps.learning.iteration import Callback, IterationReport, callbacks_of, is_false
 from kreps.learning.policy import Policy
 from kreps.learning.wrappers import without_restarts
-from kreps.presets import changed, flat
+from kreps.presets import flat, preset_of
 from kreps.seeding import Purpose, generator
 from kreps.settings import LearnerSettings
 
@@ -61,6 +61,8 @@ class Learner(Generic[MethodSettings]):
         threads: BLAS threads while learning; None leaves the number unchanged.  Another number may
             change the last bits of a policy, so learners that run at the same time in threads of
             one process must agree on it.
+        preset: ``"default"``, ``"authors"`` (as in the authors' experiment scripts), or settings of
+            the method's ``settings_type``.
         **settings: any field of the method's ``settings_type``.
 
     Raises:
@@ -83,6 +85,7 @@ class Learner(Generic[MethodSettings]):
         seed: int = 0,
         periodic: Sequence[int] | None = None,
         threads: int | None = 1,
+        preset: str | MethodSettings = "default",
         **settings: Any,
     ) -> None:
         self.seed = _whole_number("seed", seed)
@@ -99,7 +102,7 @@ class Learner(Generic[MethodSettings]):
             _, probability = without_restarts(env)
             if probability is not None and settings.get("restart_probability") is None:
                 settings["restart_probability"] = probability
-        self.settings = self._settings(settings)
+        self.settings: MethodSettings = preset_of(self.settings_type, preset, settings)
         self.task = self._completed(self.task, chooses=not isinstance(env, TaskSpec))
         if not isinstance(env, TaskSpec):
             self._act_in(env)
@@ -117,9 +120,6 @@ class Learner(Generic[MethodSettings]):
         """Collect in this environment from now on."""
         inside = environment_for(env, self.task, self.settings.restart_probability)
         self.env = held(inside, self.task.action_repeat)
-
-    def _settings(self, changes: dict[str, Any]) -> MethodSettings:
-        return changed(self.settings_type(), changes)
 
     def __repr__(self) -> str:
         state = self.state

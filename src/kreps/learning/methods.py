@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -20,16 +20,19 @@ from kreps.kernels.basis import LinearFunction
 from kreps.learning import timescale
 from kreps.learning.batches import Collected
 from kreps.learning.collect import collect_grid
-from kreps.learning.environment import Environment
+from kreps.learning.environment import Environment, known_reward_of
 from kreps.learning.learner import Learner
 from kreps.learning.on_policy import OnPolicyLearner
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT
-from kreps.presets import settings_of
 from kreps.settings import (
     GridValueIterationSettings,
     NPALPSettings,
     Settings,
     ValueIterationSettings,
+)
+
+AnyValueIterationSettings = TypeVar(
+    "AnyValueIterationSettings", ValueIterationSettings, GridValueIterationSettings
 )
 
 
@@ -39,7 +42,8 @@ class KREPS(OnPolicyLearner[Settings]):
     Args:
         env, seed, periodic, threads: as for `Learner`.
         preset: ``"model_based"``, ``"single_step"`` (one step on the sampled actions, without
-            generated samples), ``"paper"`` (close to the printed method) or a `kreps.Settings`.
+            generated samples), ``"paper"`` (close to the printed method), ``"authors"`` (as the
+            authors' scripts have it) or a `kreps.Settings`.
         compute: where low-rank updates compute sums over samples, and in which arrays.  It is not
             part of a checkpoint, so set it again after `resume`: ``learner.compute = ...``.
         **settings: any field of `kreps.Settings`, such as ``kl_bound=0.5``, ``value=kreps.Grid(5)``
@@ -64,9 +68,10 @@ class KREPS(OnPolicyLearner[Settings]):
         compute: Compute | None = None,
         **settings: Any,
     ) -> None:
-        self._preset = preset
         self.compute = compute or Compute()
-        super().__init__(env, seed=seed, periodic=periodic, threads=threads, **settings)
+        super().__init__(
+            env, seed=seed, periodic=periodic, threads=threads, preset=preset, **settings
+        )
 
     def _completed(self, task: TaskSpec, chooses: bool) -> TaskSpec:
         settings, repeat = self.settings, task.action_repeat
@@ -79,9 +84,6 @@ class KREPS(OnPolicyLearner[Settings]):
             delay=max(task.delay, settings.delay),
             history=max(task.history, history),
         )
-
-    def _settings(self, changes: dict[str, Any]) -> Settings:
-        return settings_of(self._preset, **changes)
 
     def update(self, rollouts: Iterable[Rollout] | Dataset) -> UpdateReport:
         """One update from new rollouts, collected anywhere, and those that the window has kept.
@@ -121,7 +123,19 @@ class KREPS(OnPolicyLearner[Settings]):
         return self.state.value
 
 
-class ValueIteration(OnPolicyLearner[ValueIterationSettings]):
+class AnyValueIteration(Learner[AnyValueIterationSettings]):
+    """Value iteration on any data; the reward function of the environment may be known."""
+
+    def _updated(self, samples: Any, rng: np.random.Generator) -> tuple[LearnerState, UpdateReport]:
+        known = known_reward_of(self.env) if self.settings.known_reward else None
+        return value_iteration.update(
+            self.state, samples, self.task, self.update_settings, rng, known
+        )
+
+
+class ValueIteration(
+    AnyValueIteration[ValueIterationSettings], OnPolicyLearner[ValueIterationSettings]
+):
     """Value iteration with RKHS embeddings and a softmax policy (Gruenewaelder et al. 2012).
 
     Arguments and errors are those of `Learner`, settings those of
@@ -130,10 +144,9 @@ class ValueIteration(OnPolicyLearner[ValueIterationSettings]):
 
     method = "value-iteration"
     settings_type = ValueIterationSettings
-    algorithm = staticmethod(value_iteration.update)
 
 
-class GridValueIteration(Learner[GridValueIterationSettings]):
+class GridValueIteration(AnyValueIteration[GridValueIterationSettings]):
     """Off-policy value iteration with RKHS embeddings on a grid of states and actions.
 
     Each iteration takes one step from every grid point; one iteration is enough.  The environment
@@ -147,7 +160,6 @@ class GridValueIteration(Learner[GridValueIterationSettings]):
 
     method = "grid-value-iteration"
     settings_type = GridValueIterationSettings
-    algorithm = staticmethod(value_iteration.update)
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Collected:
         settings = self.settings

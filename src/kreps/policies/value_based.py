@@ -62,12 +62,16 @@ class SoftmaxPolicy:
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
         if self.temperature == 0.0:
             return self.greedy(states)
-        probabilities = softmax(self.q_values(states) / self.temperature, axis=1)
+        probabilities = softmax(self.logits(states), axis=1)
         # one draw per state: the noise becomes a uniform number, which inverts the cumulated
         # probabilities
         uniform = ndtr(noise[:, :1])
         chosen = (np.cumsum(probabilities, axis=1) < uniform).sum(axis=1)
         return self._actions(np.minimum(chosen, len(self.candidates) - 1))
+
+    def logits(self, states: FloatArray) -> FloatArray:
+        """Log probabilities (m, k) of the candidates, up to a constant for each state."""
+        return self.q_values(states) / self.temperature
 
     def greedy(self, states: FloatArray) -> FloatArray:
         return self._actions(self.q_values(states).argmax(axis=1))

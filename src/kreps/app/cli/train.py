@@ -68,7 +68,7 @@ def train(
         str,
         typer.Option(
             help="model_based; single_step: one step on the sampled actions; paper: close to the "
-            "printed method."
+            "printed method; authors: as in the authors' scripts."
         ),
     ] = next(iter(PRESETS)),
     recipe: Annotated[str | None, typer.Option(hidden=True)] = None,

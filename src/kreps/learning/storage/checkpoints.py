@@ -40,8 +40,8 @@ from kreps.settings import LearnerSettings
 
 POLICIES_OF_METHOD = {
     "reps": {"cost-sensitive-gp", "sparse-gp"},
-    "value-iteration": {"softmax"},
-    "grid-value-iteration": {"softmax"},
+    "value-iteration": {"softmax", "relative-softmax"},
+    "grid-value-iteration": {"softmax", "relative-softmax"},
     "npalp": {"lipschitz"},
 }
 """Kinds of the policies that each method learns."""

@@ -1,4 +1,4 @@
-"""Policies as files: the task they act in, and one of four kinds of policy."""
+"""Policies as files: the task they act in, and one of five kinds of policy."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from kreps.learning.storage.codec import (
 from kreps.learning.storage.files import MAX_FILE_BYTES, reading, warn_of, write_arrays
 from kreps.policies.base import LearntPolicy
 from kreps.policies.cost_sensitive_gp import MAX_SUPPORT, CostSensitiveGP
+from kreps.policies.relative_softmax import RelativeSoftmaxPolicy
 from kreps.policies.sparse_gp import SparseGP
 from kreps.policies.value_based import LipschitzPolicy, SoftmaxPolicy
 
@@ -154,20 +155,24 @@ def gaussian_processes(m: str) -> dict[str, Record]:
     return {"cost-sensitive-gp": cost_sensitive, "sparse-gp": sparse}
 
 
+_SOFTMAX: dict[str, Node] = {
+    **_kernel_and_states("m"),
+    "table": Array(("m", "k")),
+    "candidates": Array(("k", "da")),
+    "offset": Number(),
+    "temperature": Number(TEMPERATURE),
+}
+_SOFTMAX_SIZES = {"m": SUPPORT, "k": (1, MAX_SUPPORT)}
+
 POLICY = OneOf(
     {
         **gaussian_processes("m"),
-        "softmax": Record(
-            SoftmaxPolicy,
-            {
-                **_kernel_and_states("m"),
-                "table": Array(("m", "k")),
-                "candidates": Array(("k", "da")),
-                "offset": Number(),
-                "temperature": Number(TEMPERATURE),
-            },
+        "softmax": Record(SoftmaxPolicy, _SOFTMAX, given=("task",), ranges=_SOFTMAX_SIZES),
+        "relative-softmax": Record(
+            RelativeSoftmaxPolicy,
+            {**_SOFTMAX, "action_rewards": Array(("k",))},
             given=("task",),
-            ranges={"m": SUPPORT, "k": (1, MAX_SUPPORT)},
+            ranges=_SOFTMAX_SIZES,
         ),
         "lipschitz": Record(
             LipschitzPolicy,
