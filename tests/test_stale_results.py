@@ -112,7 +112,7 @@ def test_the_paper_preset_does_not_depend_on_the_model_based_step(
     assert "kreps.envs.swing_up:MASS" in paper["code"]
     for name in ("algorithms.model_based:optimise", "models.dynamics:fit_dynamics"):
         assert f"kreps.{name}" not in paper["code"]
-    assert not any(name.startswith("kreps.settings") for name in paper["code"])
+    assert not any(name.startswith(("kreps.settings", "kreps.sections")) for name in paper["code"])
     assert paper["settings"]["kl_bound"] == PRESETS["paper"].kl_bound == 0.5
 
 

@@ -30,6 +30,7 @@ NOT_RESULTS = (
     "kreps.errors",
     "kreps.legacy",
     "kreps.presets",
+    "kreps.sections",
     "kreps.settings",
     "kreps.terminal",
     "kreps.learning.progress",
