@@ -59,7 +59,7 @@ class ModelComparison:
         Args:
             policy: with its exploration noise.
         """
-        world, model_env = self.world, self._from_starts
+        world, model_env = self.world, self.from_starts
         rng = np.random.default_rng(self.seed)
         each = model_env.evaluate(policy, world.reward_model, self.rollouts, rng)
         if world.bonus is not None:
@@ -67,11 +67,11 @@ class ModelComparison:
         elif model_env.dynamics.terminations is not None:
             rewards = each.rewards
         else:
-            rewards = each.pessimistic_rewards(self._in_worst_state(each.actions), self.typical)
+            rewards = each.pessimistic_rewards(self.in_worst_state(each.actions), self.typical)
         return average_reward(rewards, model_env.restart_probability)
 
     @cached_property
-    def _from_starts(self) -> ModelEnv:
+    def from_starts(self) -> ModelEnv:
         """The model whose rollouts all begin in start states, with what it computes only once."""
         assert self.world.model_env is not None
         return replace(self.world.model_env, exploring_starts=0.0)
@@ -85,7 +85,7 @@ class ModelComparison:
         rewards = self.world.reward_model(inputs, np.zeros(len(states)))
         return states[int(np.argmin(rewards))]
 
-    def _in_worst_state(self, actions: FloatArray) -> FloatArray:
+    def in_worst_state(self, actions: FloatArray) -> FloatArray:
         """Predicted rewards (steps, count) of actions (steps, count, da) in the worst state."""
         flat = actions.reshape(-1, actions.shape[-1])
         states = np.broadcast_to(self._worst_state, (len(flat), len(self._worst_state)))

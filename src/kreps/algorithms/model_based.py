@@ -27,6 +27,7 @@ from kreps.algorithms.acceptance import (
 from kreps.algorithms.dual import DualSolution
 from kreps.algorithms.ends import AbsorbingEnd, solve_with_end
 from kreps.algorithms.generated import GeneratedSamples, StateSource, generate, split_budget
+from kreps.algorithms.policy_gradient import improve
 from kreps.algorithms.policy_targets import PolicyFit, PolicyTargets
 from kreps.algorithms.reps import Batch, Step, stationarity_ridge
 from kreps.algorithms.state import LearnerState
@@ -35,6 +36,8 @@ from kreps.models.model_env import ModelEnv, supports_model_rollouts
 from kreps.models.novelty import novelty_bonus
 from kreps.models.world_model import WorldModel
 from kreps.policies.base import LearntPolicy
+from kreps.policies.cost_sensitive_gp import CostSensitiveGP
+from kreps.policies.sparse_gp import SparseGP
 
 PATIENCE = 3
 """Steps in a row without a gain of one standard error in the model, after which there is none."""
@@ -129,6 +132,8 @@ def model_based_step(
     seed = int(rng.integers(2**63))  # all policies of an update have the same random numbers
     comparison = compare_in_model(world, model_based.acceptance_rollouts, seed)
     best, returns = optimise(batch, world, step, comparison, rng)
+    if comparison is not None and returns is not None and model_based.gradient_steps:
+        best, returns = ascended(batch, best, returns, comparison)
     rejected = None
     if comparison is not None and returns is not None and state.policy is not None:
         gain = returns - comparison.returns(state.policy)
@@ -187,6 +192,24 @@ def optimise(
         if without_gain == PATIENCE:
             break
     return best, returns
+
+
+def ascended(
+    batch: Batch[Any, Any],
+    best: GeneratedStep,
+    returns: FloatArray,
+    comparison: ModelComparison,
+) -> tuple[GeneratedStep, FloatArray]:
+    """The policy of a step after gradient ascent, if its returns (rollouts,) are larger."""
+    model_based, policy = batch.settings.model_based, best.policy.policy
+    assert model_based is not None
+    assert isinstance(policy, CostSensitiveGP | SparseGP)
+    improved = improve(comparison, policy, model_based.gradient_steps)
+    new_returns = comparison.returns(improved)
+    batch.clock.lap("policy gradient")
+    if new_returns.mean() <= returns.mean():
+        return best, returns
+    return replace(best, policy=replace(best.policy, policy=improved)), new_returns
 
 
 def generated_step(

@@ -13,11 +13,15 @@ from typing import Protocol
 import numpy as np
 
 from kreps.errors import ConfigurationError
-from kreps.kernels.arrays import Array, FloatArray, default_errstate, like
+from kreps.kernels.arrays import Array, FloatArray, default_errstate, like, namespace
 from kreps.kernels.gram import gaussian_gram
 from kreps.kernels.kernel import Factor, Kernel, Periodic
 from kreps.kernels.linalg import solve_lower, solve_lower_transposed
 from kreps.kernels.pivoted_cholesky import pivoted_gaussian_gram
+
+PREDICTION_BATCH = 2048
+"""Inputs predicted at once.  It bounds the memory of their Gram matrix with all samples, which
+would be the largest array of an update."""
 
 MAX_GRID_CENTRES = 4096
 """Largest number of centres of a grid: the dual costs its cube."""
@@ -55,6 +59,10 @@ class LinearFunction(Protocol):
         """Its values (m,) or (m, k) at states (m, ds)."""
         ...
 
+    def jacobian(self, states: FloatArray) -> FloatArray:
+        """Derivatives (m, k, ds) of its values (m, k) at states (m, ds)."""
+        ...
+
 
 @dataclass(frozen=True)
 class KernelExpansion:
@@ -77,8 +85,26 @@ class KernelExpansion:
 
     @default_errstate()
     def __call__(self, states: Array) -> Array:
-        k = gaussian_gram(like(self.coordinates, states), self.kernel.embed(states))
-        return k.T @ like(self.alpha, states)
+        known, alpha = like(self.coordinates, states), like(self.alpha, states)
+        batches = [
+            gaussian_gram(known, self.kernel.embed(states[i : i + PREDICTION_BATCH])).T @ alpha
+            for i in range(0, max(len(states), 1), PREDICTION_BATCH)
+        ]
+        return batches[0] if len(batches) == 1 else namespace(states).concat(batches, axis=0)
+
+    @default_errstate()
+    def jacobian(self, states: FloatArray) -> FloatArray:
+        """Derivatives (m, k, ds) of its values (m, k) at states (m, ds).
+
+        Those by the coordinates e are ``sum_j alpha_j k(s~_j, s) (e_j - e(s))``.
+        """
+        e = self.kernel.embed(states)
+        k = gaussian_gram(e, self.coordinates)
+        slopes = np.empty((len(states), self.alpha.shape[1], e.shape[1]))
+        for j, alpha in enumerate(self.alpha.T):
+            terms = k * alpha
+            slopes[:, j] = terms @ self.coordinates - terms.sum(axis=1)[:, None] * e
+        return self.kernel.pullback(states, slopes)
 
 
 @dataclass(frozen=True)
@@ -121,7 +147,7 @@ class RKHSBasis:
         k = self.kernel.gram(like(self.pivots, states), states)
         return solve_lower(like(self.lower, states), k).T
 
-    def function(self, theta: FloatArray) -> LinearFunction:
+    def function(self, theta: FloatArray) -> KernelExpansion:
         return KernelExpansion(self.kernel, self.pivots, solve_lower_transposed(self.lower, theta))
 
 

@@ -3,8 +3,8 @@
 Every kernel of the paper is ``k(x, y) = exp(-|e(x) - e(y)|^2 / 2)`` for some map e into Euclidean
 coordinates.  A squared exponential has ``e(x) = x / l``.  The periodic kernel
 ``exp(-2 sin^2((x - y) / 2) / l^2)`` has ``e(x) = (cos x, sin x) / l``.  A product of kernels
-concatenates the embeddings.  So a new kernel is one class with a method `Factor.coordinates`, and
-a Gram matrix is one thin matrix product and one exponential.
+concatenates the embeddings.  So a new kernel is one class with a method `Factor.coordinates` and
+its derivative, and a Gram matrix is one thin matrix product and one exponential.
 """
 
 from __future__ import annotations
@@ -47,6 +47,15 @@ class Factor(Protocol):
         """Euclidean coordinates (n, m) of inputs (n, d) at lengthscale one."""
         ...
 
+    def pullback(self, x: FloatArray, slopes: FloatArray) -> FloatArray:
+        """Derivatives (n, k, len(dims)) of k functions by the columns ``dims`` at inputs (n, d).
+
+        Args:
+            x: (n, d) inputs.
+            slopes: (n, k, m) derivatives by the coordinates.
+        """
+        ...
+
 
 @dataclass(frozen=True)
 class SquaredExponential:
@@ -56,6 +65,9 @@ class SquaredExponential:
 
     def coordinates(self, x: Array) -> Array:
         return columns(x, self.dims)
+
+    def pullback(self, x: FloatArray, slopes: FloatArray) -> FloatArray:
+        return slopes
 
 
 @dataclass(frozen=True)
@@ -67,6 +79,11 @@ class Periodic:
     def coordinates(self, x: Array) -> Array:
         xp, angles = namespace(x), columns(x, self.dims)
         return xp.concat([xp.cos(angles), xp.sin(angles)], axis=1)
+
+    def pullback(self, x: FloatArray, slopes: FloatArray) -> FloatArray:
+        angles = x[:, None, list(self.dims)]
+        by_cos, by_sin = np.split(slopes, 2, axis=2)
+        return by_sin * np.cos(angles) - by_cos * np.sin(angles)
 
 
 @dataclass(frozen=True)
@@ -87,6 +104,9 @@ class WrapAngle:
 
     def coordinates(self, x: Array) -> Array:
         return (columns(x, self.dims) - self.begin) % (2.0 * np.pi)
+
+    def pullback(self, x: FloatArray, slopes: FloatArray) -> FloatArray:
+        return slopes
 
 
 @dataclass(frozen=True)
@@ -109,6 +129,11 @@ class SmoothedImage:
         down, across = (like(smoothing(size), x) for size in self.shape)
         smooth = down @ xp.reshape(columns(x, self.dims), (n, *self.shape)) @ across.T
         return xp.reshape(smooth, (n, down.shape[0] * across.shape[0]))
+
+    def pullback(self, x: FloatArray, slopes: FloatArray) -> FloatArray:
+        down, across = (smoothing(size) for size in self.shape)
+        each = slopes.reshape(*slopes.shape[:2], len(down), len(across))
+        return (down.T @ each @ across).reshape(*slopes.shape[:2], -1)
 
 
 @cache
@@ -188,6 +213,20 @@ class Kernel:
             ],
             axis=1,
         )
+
+    def pullback(self, x: FloatArray, slopes: FloatArray) -> FloatArray:
+        """Derivatives (n, k, d) of k functions at inputs (n, d), by the chain rule.
+
+        Args:
+            x: (n, d) inputs.
+            slopes: (n, k, m) derivatives by the coordinates of `embed`.
+        """
+        widths = [factor.coordinates(x[:1]).shape[1] for factor in self.factors]
+        parts = np.split(slopes, np.cumsum(widths)[:-1], axis=2)
+        pulled = np.zeros((*slopes.shape[:2], x.shape[1]))
+        for factor, lengthscale, part in zip(self.factors, self.lengthscales, parts, strict=True):
+            pulled[:, :, list(factor.dims)] += factor.pullback(x, part / lengthscale)
+        return pulled
 
     def gram(self, x: Array, y: Array | None = None) -> Array:
         """``[k(x_i, y_j)]``, (n, k), for inputs (n, d) and (k, d); ``y`` None means ``x``."""

@@ -6,20 +6,14 @@ any state and action.  The same machinery regresses changes of state and rewards
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from kreps.kernels.arrays import Array, FloatArray, IntArray, as_numpy
-from kreps.kernels.basis import Basis, RKHSBasis
-from kreps.kernels.gram import gaussian_gram
+from kreps.kernels.basis import Basis, KernelExpansion, LinearFunction, RKHSBasis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.linalg import Cholesky, cholesky, solve_lower, with_diagonal
-
-PREDICTION_BATCH = 2048
-"""Inputs predicted at once.  It bounds the memory of their Gram matrix with all samples, which
-would be the largest array of an update."""
 
 MAX_RESIDUAL_RATIO = 1e-4
 """Largest kernel residual of a sample in `PivotedEmbedding`, as a share of the regulariser.
@@ -102,26 +96,9 @@ class KernelEmbedding:
         added = self.regulariser + self.factor.jitter
         return successor_features - added * self.factor.solve(successor_features)
 
-    def predictor(
-        self, targets: FloatArray, batch_size: int = PREDICTION_BATCH
-    ) -> Callable[[FloatArray], FloatArray]:
-        """The expectation of targets (n, r) as a function of inputs (m, ds + da).
-
-        Args:
-            targets: (n, r) at the samples.
-            batch_size: number of inputs that are predicted at once.
-        """
-        solved = self.factor.solve(targets)
-        known = self.kernel.embed(self.inputs)
-
-        def predict(inputs: FloatArray) -> FloatArray:
-            expected = np.empty((len(inputs), *solved.shape[1:]))
-            for first in range(0, len(inputs), batch_size):
-                batch = slice(first, first + batch_size)
-                expected[batch] = gaussian_gram(self.kernel.embed(inputs[batch]), known) @ solved
-            return expected
-
-        return predict
+    def predictor(self, targets: FloatArray) -> KernelExpansion:
+        """The expectation of targets (n, r) as a function of inputs (m, ds + da)."""
+        return KernelExpansion(self.kernel, self.inputs, self.factor.solve(targets))
 
     def leave_one_out(self, targets: FloatArray) -> LeaveOneOut:
         """Errors of targets F' (n, r): ``[C^-1 F']_i / [C^-1]_ii`` with ``C = K_sa + lambda I``."""
@@ -174,7 +151,7 @@ class PivotedEmbedding:
         factor = cholesky(with_diagonal(features.T @ features, regulariser))
         return cls(basis, features, regulariser, factor)
 
-    def predictor(self, targets: FloatArray) -> Callable[[FloatArray], FloatArray]:
+    def predictor(self, targets: FloatArray) -> KernelExpansion:
         """The expectation of targets (n, r) as a function of inputs (m, ds + da)."""
         return self.basis.function(self.factor.solve(self.features.T @ targets))
 
@@ -226,7 +203,7 @@ class FeatureRegression:
         jitter: of the factorisation of ``Psi'Psi + lambda I``.
     """
 
-    mean: Callable[[Array], Array]
+    mean: LinearFunction
     jitter: float
 
     @classmethod

@@ -2,8 +2,9 @@
 
 Eq. 4 regresses hundreds of features of V separately, although all are functions of one successor.
 Here the change of state is regressed instead: its linear mean by ridge regression, then the
-remainder with the kernel, the leave-one-out fit and the regulariser of Eq. 4.  The features of V
-are computed at the predicted successor.
+remainder with the kernel, the leave-one-out fit and the regulariser of Eq. 4, each coordinate for
+itself where that predicts it better (`kreps.models.coordinates`).  The features of V are computed
+at the predicted successor.
 
 Features at the mean successor are not yet expected features, as the noise is missing.  The
 leave-one-out residual ``e_i`` of a sample is a draw of the noise at its state, so
@@ -20,7 +21,6 @@ regressed.  The others follow from it, from the state and from the action.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -30,11 +30,12 @@ from kreps.data.history import state_changes_of
 from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import Array, FloatArray, IntArray, columns, like
-from kreps.kernels.basis import Basis
+from kreps.kernels.basis import PREDICTION_BATCH, Basis
 from kreps.kernels.kernel import Kernel
-from kreps.kernels.regression import PREDICTION_BATCH, LeaveOneOut
+from kreps.kernels.regression import LeaveOneOut
+from kreps.models.coordinates import Regression, fit_coordinates
 from kreps.models.terminations import Terminations, fit_terminations
-from kreps.models.transition import fit_regression, state_actions
+from kreps.models.transition import state_actions
 
 CONSTANT_RTOL = 1e-12
 """A coordinate whose standard deviation, or root mean square change, is below this share of its
@@ -79,6 +80,12 @@ class LinearMean:
     def __call__(self, inputs: Array) -> Array:
         """Its values (n, k) at inputs (n, d)."""
         return columns(inputs, self.used) @ like(self.slopes, inputs) + like(self.constants, inputs)
+
+    def jacobian(self, width: int) -> FloatArray:
+        """Derivatives (k, width) of its values by that many inputs."""
+        slopes = np.zeros((len(self.constants), width))
+        slopes[:, self.used] = self.slopes.T
+        return slopes
 
 
 @dataclass(frozen=True)
@@ -133,6 +140,21 @@ class DeltaStateTargets:
             predictions: (n, do) targets plus linear mean.
         """
         return state_changes_of(inputs, self.changes(predictions), self.task)
+
+    def jacobian(self, slopes: FloatArray) -> FloatArray:
+        """Derivatives (m, ds, ds + da) of the changes of state by states and actions.
+
+        Args:
+            slopes: (m, do, ds + da) derivatives of targets plus linear mean.
+        """
+        of_observation = self.scale[:, None] * slopes
+        if self.task.state_size == self.task.observation_size:
+            return of_observation
+        # `state_changes_of` is linear, so that its columns are its values at unit vectors
+        size, width = self.task.observation_size, slopes.shape[2]
+        by_inputs = state_changes_of(np.eye(width), np.zeros((width, size)), self.task)
+        by_changes = state_changes_of(np.zeros((size, width)), np.eye(size), self.task)
+        return by_inputs.T + by_changes.T @ of_observation
 
     def residuals(self, errors: FloatArray) -> FloatArray:
         """Errors of successors (n, ds), from those of targets (n, do).
@@ -192,13 +214,13 @@ class Dynamics:
 
     Attributes:
         delta_targets: scale and linear mean of the targets.
-        regression: predicts targets (m, do) from states and scaled, applied actions (m, ds + da).
+        regression: of targets (m, do) on states and scaled, applied actions (m, ds + da).
         loo_residuals: (n, do) leave-one-out errors of the targets.
         terminations: the termination model; None if no episode terminated.
     """
 
     delta_targets: DeltaStateTargets
-    regression: Callable[[FloatArray], FloatArray]
+    regression: Regression
     loo_residuals: FloatArray
     terminations: Terminations | None = None
 
@@ -215,6 +237,15 @@ class Dynamics:
         """
         successors = self._mean_successors(inputs)
         return successors, self.termination_probabilities(successors)
+
+    def jacobian(self, inputs: FloatArray) -> FloatArray:
+        """Derivatives (m, ds, ds + da) of mean successors by inputs (m, ds + da)."""
+        slopes = self.regression.jacobian(inputs)
+        slopes += self.delta_targets.linear_mean.jacobian(inputs.shape[1])
+        by_inputs = self.delta_targets.jacobian(slopes)
+        states = np.arange(by_inputs.shape[1])
+        by_inputs[:, states, states] += 1.0
+        return by_inputs
 
     def termination_probabilities(self, successors: FloatArray) -> FloatArray:
         """Probabilities (m,) that an episode ends in successors (m, ds)."""
@@ -329,9 +360,9 @@ def fit_dynamics(
     """
     delta_targets = DeltaStateTargets.fit(data, task)
     targets = delta_targets.targets(data, task)
-    model, x = fit_regression(data, targets, state_kernel, task, start, rng)
-    loo_residuals = model.leave_one_out(targets).errors
+    regression, loo_residuals, x, jitter = fit_coordinates(
+        data, targets, state_kernel, task, start, rng
+    )
     terminations = fit_terminations(data, state_kernel, rng)
-    dynamics = Dynamics(delta_targets, model.predictor(targets), loo_residuals, terminations)
-    jitter = max(model.factor.jitter, 0.0 if terminations is None else terminations.jitter)
-    return dynamics, x, jitter
+    dynamics = Dynamics(delta_targets, regression, loo_residuals, terminations)
+    return dynamics, x, max(jitter, 0.0 if terminations is None else terminations.jitter)

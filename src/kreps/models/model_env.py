@@ -78,8 +78,13 @@ def average_reward(rewards: FloatArray, restart_probability: float) -> FloatArra
         rewards: (steps, count) without restarts.
         restart_probability: p.
     """
-    share = (1.0 - restart_probability) ** np.arange(len(rewards))
-    return share @ rewards / share.sum()
+    return step_shares(len(rewards), restart_probability) @ rewards
+
+
+def step_shares(steps: int, restart_probability: float) -> FloatArray:
+    """Shares (steps,) of the steps in the average reward of a rollout."""
+    share = (1.0 - restart_probability) ** np.arange(steps)
+    return share / share.sum()
 
 
 @dataclass(frozen=True)
@@ -163,10 +168,10 @@ class ModelEnv:
         left = left[: 1 + np.searchsorted(np.cumsum(left), count)]
         left[-1] -= left.sum() - count
         visited, nearest = [], []
-        states = self._starts(len(left), rng)
+        states = self.starts(len(left), rng)
         while len(states):
             noise = RolloutNoise.sample(len(states), self.task.action_size, rng)
-            step = self._step(policy.act, states, noise)
+            step = self.step(policy.act, states, noise)
             visited.append(states)
             nearest.append(step.nearest)
             left = np.where(step.terminated, 0, left - 1)
@@ -189,14 +194,13 @@ class ModelEnv:
             count: number of rollouts.
             rng: of starts and noise.
         """
-        steps = min(ceil(EVALUATION_LENGTHS / self.restart_probability), self.max_steps)
-        steps = min(steps, MAX_EVALUATION_STEPS)
+        steps = self.evaluation_steps
         inputs, similarity, terminations, ended = [], [], [], []
         over = np.zeros(count, dtype=bool)
-        states = self._starts(count, rng)
+        states = self.starts(count, rng)
         for _ in range(steps):
             noise = RolloutNoise.sample(count, self.task.action_size, rng)
-            step = self._step(policy.act, states, noise)
+            step = self.step(policy.act, states, noise)
             inputs.append(step.inputs)
             similarity.append(step.similarity)
             terminations.append(step.terminations)
@@ -210,6 +214,12 @@ class ModelEnv:
             similarity=np.stack(similarity),
             ended=np.stack(ended),
         )
+
+    @property
+    def evaluation_steps(self) -> int:
+        """Steps of a rollout in which a policy is evaluated."""
+        steps = min(ceil(EVALUATION_LENGTHS / self.restart_probability), self.max_steps)
+        return min(steps, MAX_EVALUATION_STEPS)
 
     def trajectories(
         self, policy: StochasticPolicy, starts: FloatArray, steps: int, rng: np.random.Generator
@@ -229,14 +239,14 @@ class ModelEnv:
         going = np.arange(len(starts))
         for t in range(steps):
             noise = RolloutNoise.sample(len(going), self.task.action_size, rng)
-            step = self._step(policy.act, visited[t, going], noise)
+            step = self.step(policy.act, visited[t, going], noise)
             going, successors = going[~step.terminated], step.successors[~step.terminated]
             if not len(going):
                 break
             visited[t + 1, going] = successors
         return visited
 
-    def _step(
+    def step(
         self,
         act: Callable[[FloatArray, FloatArray], FloatArray],
         states: FloatArray,
@@ -247,7 +257,7 @@ class ModelEnv:
         actions = self.task.scaled_applied(act(states, noise.action_noise))
         inputs = np.concatenate([states, actions], axis=1)
         successors, terminations = self.dynamics.sample(nearest, inputs, noise.residual_signs)
-        successors = np.clip(successors, *self._range)
+        successors = self.within_range(successors)
         terminated = noise.end_uniforms < terminations
         return ModelStep(nearest, similarity, inputs, successors, terminations, terminated)
 
@@ -281,12 +291,31 @@ class ModelEnv:
         apart = embedded - samples[:-1, rows].T
         return rows, np.exp(-0.5 * np.sum(apart * apart, axis=1))
 
-    def _starts(self, count: int, rng: np.random.Generator) -> FloatArray:
+    def starts(self, count: int, rng: np.random.Generator) -> FloatArray:
+        """First states (count, ds) of rollouts."""
         starts = self.data.points[rng.choice(self.data.start, count)]
         if not self.exploring_starts:
             return starts
         anywhere = self.data.points[rng.choice(self.data.state, count)]
         return np.where(rng.uniform(size=(count, 1)) < self.exploring_starts, anywhere, starts)
+
+    def within_range(self, states: FloatArray) -> FloatArray:
+        """States clipped to the range of the data."""
+        return np.clip(states, *self._range)
+
+    def is_within_range(self, states: FloatArray) -> BoolArray:
+        """Where the coordinates of states would not be clipped."""
+        low, high = self._range
+        return (states > low) & (states < high)
+
+    def similarity_slopes(
+        self, states: FloatArray, nearest: IntArray, factor: FloatArray
+    ) -> FloatArray:
+        """Derivatives (m, ds) of the similarity to the nearest samples, times a factor (m,)
+        over the similarity."""
+        mean, samples = self._samples
+        apart = self.kernel.embed(states) - mean - samples[:-1, nearest].T
+        return self.kernel.pullback(states, -(factor[:, None] * apart)[:, None])[:, 0]
 
     @cached_property
     def _range(self) -> tuple[FloatArray, FloatArray]:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from kreps.data.rollouts import Transitions
 from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.kernels.basis import LinearFunction
 from kreps.kernels.regression import LeaveOneOut
 
 MAX_HELD_OUT = 300
@@ -35,7 +35,7 @@ class RewardModel:
         loo: leave-one-out errors of the regression, at some steps; None if they are not known.
     """
 
-    regression: Callable[[FloatArray], FloatArray]
+    regression: LinearFunction
     mean: float
     at_termination: float
     smallest: float
@@ -53,6 +53,16 @@ class RewardModel:
         predicted = predicted + probabilities * self.at_termination
         return np.clip(predicted, self.smallest, self.largest)
 
+    def jacobian(self, inputs: FloatArray, predicted: FloatArray) -> FloatArray:
+        """Derivatives (m, ds + da) of rewards; zero where they are clipped.
+
+        Args:
+            inputs: (m, ds + da) states and scaled, applied actions.
+            predicted: (m,) the rewards there.
+        """
+        clipped = (predicted <= self.smallest) | (predicted >= self.largest)
+        return np.where(clipped[:, None], 0.0, self.regression.jacobian(inputs)[:, 0])
+
 
 def regressed_steps(data: Transitions) -> IntArray:
     """Numbers of the steps whose rewards are regressed: those without a termination.
@@ -69,7 +79,7 @@ def held_out_steps(count: int) -> IntArray:
 
 
 def reward_model(
-    regression: Callable[[FloatArray], FloatArray],
+    regression: LinearFunction,
     rewards: FloatArray,
     data: Transitions,
     inputs: FloatArray,

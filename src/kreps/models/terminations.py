@@ -14,7 +14,7 @@ import numpy as np
 
 from kreps.data.rollouts import Transitions
 from kreps.kernels.arrays import Array, FloatArray, namespace
-from kreps.kernels.basis import Basis
+from kreps.kernels.basis import Basis, LinearFunction
 from kreps.kernels.hyperparameters import EmbeddingLoss, Prior, factor_distances, minimise
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.regression import (
@@ -47,13 +47,18 @@ class Terminations:
         jitter: of the factorisation.
     """
 
-    regression: Callable[[Array], Array]
+    regression: LinearFunction
     loo_residuals: FloatArray
     jitter: float
 
     def probabilities(self, successors: Array) -> Array:
         """Probabilities (m,) that an episode ends in successors (m, ds)."""
         return as_probabilities(self.regression)(successors)
+
+    def jacobian(self, successors: FloatArray, probabilities: FloatArray) -> FloatArray:
+        """Derivatives (m, ds) of probabilities (m,) by successors (m, ds); zero where clipped."""
+        clipped = (probabilities <= 0.0) | (probabilities >= 1.0)
+        return np.where(clipped[:, None], 0.0, self.regression.jacobian(successors)[:, 0])
 
 
 def as_probabilities(regression: Callable[[Array], Array]) -> Callable[[Array], Array]:

@@ -194,6 +194,8 @@ class HyperparameterFit:
         task: TaskSpec,
         start: FloatArray | None,
         rng: np.random.Generator,
+        further_starts: tuple[FloatArray, ...] = (),
+        log_lengthscale_std: float = LOG_LENGTHSCALE_STD,
     ) -> HyperparameterFit:
         """The problem for n samples; arguments as of `embedding_hyperparameters`."""
         action_factors = tuple(
@@ -206,7 +208,7 @@ class HyperparameterFit:
         median = np.log(np.append(state_kernel.lengthscales, action_lengthscales))
         prior = Prior(
             centre=np.append(median, np.log(REGULARISER)),
-            std=np.append(np.full(len(factors), LOG_LENGTHSCALE_STD), LOG_REGULARISER_STD),
+            std=np.append(np.full(len(factors), log_lengthscale_std), LOG_REGULARISER_STD),
             low=np.append(median - LOG_LENGTHSCALE_RANGE, np.log(REGULARISER_RANGE[0])),
             high=np.append(median + LOG_LENGTHSCALE_RANGE, np.log(REGULARISER_RANGE[1])),
             # the loss is 2 / n times the negative log likelihood of Gaussian errors of fitted
@@ -217,7 +219,7 @@ class HyperparameterFit:
         loss = EmbeddingLoss(distances, targets[rows], weights / weights.mean())
         noisy = np.append(median, np.log(REGULARISER_OF_NOISY_DATA))
         starts = (prior.centre, noisy) if start is None else (start, prior.centre, noisy)
-        return cls(Kernel(factors, np.exp(median)), loss, prior, starts)
+        return cls(Kernel(factors, np.exp(median)), loss, prior, (*starts, *further_starts))
 
     def solve(self) -> FloatArray:
         """Log hyper-parameters (g + da + 1,) with the smallest loss plus prior."""
@@ -231,6 +233,8 @@ def embedding_hyperparameters(
     task: TaskSpec,
     start: FloatArray | None,
     rng: np.random.Generator,
+    further_starts: tuple[FloatArray, ...] = (),
+    log_lengthscale_std: float = LOG_LENGTHSCALE_STD,
 ) -> tuple[Kernel, float, FloatArray]:
     """Kernel and regulariser of a regression, by leave-one-out error (Eq. 4), and their logs.
 
@@ -242,8 +246,12 @@ def embedding_hyperparameters(
         task: number of action coordinates.
         start: log hyper-parameters (g + da + 1,) of the last fit, if there was one.
         rng: draws the samples of the fit.
+        further_starts: more of them.
+        log_lengthscale_std: prior standard deviation of a log lengthscale.
     """
-    fit = HyperparameterFit.from_samples(inputs, targets, state_kernel, task, start, rng)
+    fit = HyperparameterFit.from_samples(
+        inputs, targets, state_kernel, task, start, rng, further_starts, log_lengthscale_std
+    )
     x = fit.solve()
     return fit.kernel.with_lengthscales(np.exp(x[:-1])), float(np.exp(x[-1])), x
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import Array, FloatArray, as_numpy, namespace
-from kreps.kernels.basis import RKHSBasis
+from kreps.kernels.basis import KernelExpansion, RKHSBasis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.linalg import solve_lower_transposed
 
@@ -144,6 +144,18 @@ class SparseGP:
     def standard_deviation(self, states: FloatArray) -> FloatArray:
         """Standard deviation (m, da) of the commanded action, in the task's units."""
         return self._deviation(self._covariances(states))[:, None] * self.task.action_scale
+
+    def scaled_mean(self, states: FloatArray) -> FloatArray:
+        """Mean action (m, da) at states (m, ds), around its centre in units of the action scale."""
+        return self._mean(self._covariances(states))
+
+    def mean_jacobian(self, states: FloatArray) -> FloatArray:
+        """Derivatives (m, da, ds) of `scaled_mean`."""
+        return KernelExpansion(self.kernel, self.states, self.mean_weights).jacobian(states)
+
+    def kernel_values(self, states: FloatArray) -> FloatArray:
+        """Kernel values (m, r) of states (m, ds) with the centres."""
+        return self._covariances(states).T
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
         k = self._covariances(states)
