@@ -28,7 +28,6 @@ from kreps.models.return_gradient import (
     action_gradient,
     average_return,
     roll_out,
-    step_rewards,
 )
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 from kreps.policies.sparse_gp import SparseGP
@@ -72,7 +71,7 @@ class Ascent:
         if env.dynamics.terminations is None:
             actions = record.inputs[:, :, record.states.shape[2] :]
             pessimism = Pessimism(comparison.in_worst_state(actions), comparison.typical)
-        rewards = step_rewards(env, record, comparison.world.reward_model, pessimism)
+        rewards = StepRewards.of(record, comparison.world.reward_model, pessimism)
         return float(average_return(env, record, rewards.values).mean()), record, rewards
 
     def direction(

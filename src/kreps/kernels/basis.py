@@ -14,7 +14,7 @@ import numpy as np
 
 from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import Array, FloatArray, default_errstate, like, namespace
-from kreps.kernels.gram import gaussian_gram
+from kreps.kernels.gram import BLOCK_ENTRIES, gaussian_gram
 from kreps.kernels.kernel import Factor, Kernel, Periodic
 from kreps.kernels.linalg import solve_lower, solve_lower_transposed
 from kreps.kernels.pivoted_cholesky import pivoted_gaussian_gram
@@ -99,11 +99,14 @@ class KernelExpansion:
         Those by the coordinates e are ``sum_j alpha_j k(s~_j, s) (e_j - e(s))``.
         """
         e = self.kernel.embed(states)
-        k = gaussian_gram(e, self.coordinates)
         slopes = np.empty((len(states), self.alpha.shape[1], e.shape[1]))
-        for j, alpha in enumerate(self.alpha.T):
-            terms = k * alpha
-            slopes[:, j] = terms @ self.coordinates - terms.sum(axis=1)[:, None] * e
+        height = max(1, BLOCK_ENTRIES // max(len(self.coordinates), 1))
+        for first in range(0, len(states), height):  # so that products stay in the cache
+            rows = slice(first, first + height)
+            k = gaussian_gram(e[rows], self.coordinates)
+            for j, alpha in enumerate(self.alpha.T):
+                terms = k * alpha
+                slopes[rows, j] = terms @ self.coordinates - terms.sum(axis=1)[:, None] * e[rows]
         return self.kernel.pullback(states, slopes)
 
 

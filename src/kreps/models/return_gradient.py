@@ -105,21 +105,6 @@ def roll_out(env: ModelEnv, policy: SparseGP, noise: FixedNoise) -> RolloutRecor
 
 
 @dataclass(frozen=True)
-class StepRewards:
-    """Rewards of a `RolloutRecord` and their derivatives.
-
-    Attributes:
-        values: (steps, m) expected, standardised, as if no episode had ended.
-        slopes: (steps, m, ds + da) by states and scaled, applied actions.
-        by_termination: (steps, m) by the probability of a termination.
-    """
-
-    values: FloatArray
-    slopes: FloatArray
-    by_termination: FloatArray
-
-
-@dataclass(frozen=True)
 class Pessimism:
     """Towards which rewards those of states unlike any sample are shrunk.
 
@@ -132,38 +117,66 @@ class Pessimism:
     typical: float
 
 
-def step_rewards(
-    env: ModelEnv, record: RolloutRecord, model: RewardModel, pessimism: Pessimism | None
-) -> StepRewards:
-    """Rewards as predicted, or shrunk towards worse ones in states unlike any sample.
+@dataclass(frozen=True)
+class StepRewards:
+    """Rewards of a `RolloutRecord`.
 
-    Args:
-        env: the model.
-        record: rollouts in it.
+    Attributes:
+        predicted: (steps, m) expected, standardised, as if no episode had ended.
+        worst: (steps, m) towards which they are shrunk.
+        known: (steps, m) by how much they are not, from 0 to 1.
         model: of the rewards.
-        pessimism: None for rewards as predicted.
     """
-    steps, count, width = record.inputs.shape
-    inputs = record.inputs.reshape(-1, width)
-    values = model(inputs, record.terminations.reshape(-1))
-    slopes = model.jacobian(inputs, values)
-    by_termination = np.where(slopes.any(axis=1), model.at_termination, 0.0)
-    if pessimism is not None:
+
+    predicted: FloatArray
+    worst: FloatArray
+    known: FloatArray
+    model: RewardModel
+
+    @classmethod
+    def of(
+        cls, record: RolloutRecord, model: RewardModel, pessimism: Pessimism | None
+    ) -> StepRewards:
+        """Rewards as predicted, or shrunk towards worse ones in states unlike any sample.
+
+        Args:
+            record: rollouts.
+            model: of the rewards.
+            pessimism: None for rewards as predicted.
+        """
+        inputs = record.inputs.reshape(-1, record.inputs.shape[2])
+        predicted = model(inputs, record.terminations.reshape(-1)).reshape(record.alive.shape)
+        if pessimism is None:
+            return cls(predicted, predicted, np.ones_like(predicted), model)
+        known = np.minimum(record.similarity / pessimism.typical, 1.0)
+        return cls(predicted, np.minimum(pessimism.worst, predicted), known, model)
+
+    @property
+    def values(self) -> FloatArray:
+        """Rewards (steps, m)."""
+        values: FloatArray = self.worst + self.known * (self.predicted - self.worst)
+        return values
+
+    def slopes(self, env: ModelEnv, record: RolloutRecord) -> tuple[FloatArray, FloatArray]:
+        """Derivatives of the rewards.
+
+        Returns:
+            Those by states and scaled, applied actions (steps, m, ds + da), and those by the
+            probability of a termination (steps, m).
+        """
+        steps, count, width = record.inputs.shape
         size = record.states.shape[2]
-        worst = np.minimum(pessimism.worst.reshape(-1), values)
-        known = np.minimum(record.similarity.reshape(-1) / pessimism.typical, 1.0)
-        by_state = env.similarity_slopes(
-            record.states.reshape(-1, size), record.nearest.reshape(-1), known * (known < 1.0)
-        )
-        # the price of an action is the same in the worst state
-        slopes[:, :size] *= known[:, None]
-        slopes[:, :size] += (values - worst)[:, None] * by_state
-        values = worst + known * (values - worst)
-    return StepRewards(
-        values.reshape(steps, count),
-        slopes.reshape(steps, count, width),
-        by_termination.reshape(steps, count),
-    )
+        inputs, known = record.inputs.reshape(-1, width), self.known.reshape(-1)
+        slopes = self.model.jacobian(inputs, self.predicted.reshape(-1))
+        by_termination = np.where(slopes.any(axis=1), self.model.at_termination, 0.0)
+        if (known < 1.0).any():
+            by_state = env.similarity_slopes(
+                inputs[:, :size], record.nearest.reshape(-1), known * (known < 1.0)
+            )
+            # the price of an action is the same in the worst state
+            slopes[:, :size] *= known[:, None]
+            slopes[:, :size] += (self.predicted - self.worst).reshape(-1, 1) * by_state
+        return slopes.reshape(steps, count, width), by_termination.reshape(steps, count)
 
 
 def average_return(env: ModelEnv, record: RolloutRecord, rewards: FloatArray) -> FloatArray:
@@ -193,7 +206,9 @@ def action_gradient(
     of_policy = policy.mean_jacobian(flat).reshape(steps, count, -1, size)
     of_termination = _termination_slopes(env, record)
     inside = env.is_within_range(record.successors)
-    limits = _adjoint_limits(env, shares, rewards, of_termination)
+    of_reward, reward_by_termination = rewards.slopes(env, record)
+    values = rewards.values
+    limits = _adjoint_limits(env, shares, values, of_reward, of_termination)
     scale = env.data.states.std(axis=0)
     gradient = np.zeros_like(record.commanded)
     by_state, by_alive = np.zeros((count, size)), np.zeros(count)
@@ -202,12 +217,12 @@ def action_gradient(
         by_state *= np.minimum(1.0, limits[t] / np.maximum(length, 1e-300))[:, None]
         by_state *= inside[t]
         earned = shares[t] * record.alive[t]
-        by_termination = earned * rewards.by_termination[t] - record.alive[t] * by_alive
+        by_termination = earned * reward_by_termination[t] - record.alive[t] * by_alive
         by_state += by_termination[:, None] * of_termination[t]
-        lost = rewards.values[t] - env.end_reward
+        lost = values[t] - env.end_reward
         by_alive = shares[t] * lost + by_alive * (1.0 - record.terminations[t])
         by_input = np.einsum("mi,mij->mj", by_state, of_successor[t])
-        by_input += earned[:, None] * rewards.slopes[t]
+        by_input += earned[:, None] * of_reward[t]
         by_action, commanded = by_input[:, size:], record.commanded[t]
         clipped = np.abs(commanded) >= 1.0
         gradient[t] = np.where(clipped & (by_action * commanded > 0.0), 0.0, by_action)
@@ -229,14 +244,17 @@ def _termination_slopes(env: ModelEnv, record: RolloutRecord) -> FloatArray:
 
 
 def _adjoint_limits(
-    env: ModelEnv, shares: FloatArray, rewards: StepRewards, of_termination: FloatArray
+    env: ModelEnv,
+    shares: FloatArray,
+    values: FloatArray,
+    of_reward: FloatArray,
+    of_termination: FloatArray,
 ) -> FloatArray:
     """Largest derivative (steps,) of what is earned after each step, by the scaled state."""
     scale = env.data.states.std(axis=0)
-    slopes = rewards.slopes[:, :, : len(scale)]
-    typical = _root_mean_square(slopes * scale)
+    typical = _root_mean_square(of_reward[:, :, : len(scale)] * scale)
     if of_termination.any():
-        lost = np.abs(rewards.values - env.end_reward).mean() / (4.0 * env.restart_probability)
+        lost = np.abs(values - env.end_reward).mean() / (4.0 * env.restart_probability)
         typical += lost * _root_mean_square(of_termination * scale)
     limits: FloatArray = typical * np.cumsum(shares[::-1])[::-1]
     return limits
