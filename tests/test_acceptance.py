@@ -294,8 +294,8 @@ def test_the_cost_of_an_action_not_taken_does_not_make_new_states_look_worse() -
     slowest = float(env.data.states[:, 1].min())
     model = world.reward_model
     wanted = model.mean + 0.1 * slowest  # without any cost
-    found = comparison._in_worst_state(np.zeros((3, 2, 1)))
+    found = comparison.in_worst_state(np.zeros((3, 2, 1)))
     np.testing.assert_allclose(found, np.full((3, 2), wanted), rtol=1e-12)
     # a costly action is as costly there as anywhere
-    costly = comparison._in_worst_state(np.ones((3, 2, 1)))
+    costly = comparison.in_worst_state(np.ones((3, 2, 1)))
     np.testing.assert_allclose(costly, np.maximum(found - 5.0, model.smallest), rtol=1e-12)

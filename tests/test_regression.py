@@ -8,6 +8,7 @@ from operator import add
 import numpy as np
 import pytest
 
+from kreps.kernels import basis
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.kernel import Kernel, Periodic, SquaredExponential, factors_of
@@ -145,10 +146,13 @@ def test_the_predictor_extends_the_expectation_at_the_samples(regulariser: float
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 30])
-def test_predictions_in_batches_are_those_at_once(count: int) -> None:
+def test_predictions_in_batches_are_those_at_once(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(basis, "PREDICTION_BATCH", 8)
     model, targets = fitted(20, 21, 0.05)
     queries = np.random.default_rng(22).normal(size=(count, 3))
-    found = model.predictor(targets, batch_size=8)(queries)
+    found = model.predictor(targets)(queries)
     assert found.shape == (count, targets.shape[1])
     np.testing.assert_allclose(found, model.strengths(queries).T @ targets, atol=1e-9)
 

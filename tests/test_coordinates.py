@@ -1,0 +1,97 @@
+"""The regression of several targets, each with its own kernel where that predicts it better."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from kreps.data.rollouts import Rollout, Transitions
+from kreps.data.task import TaskSpec
+from kreps.kernels.arrays import FloatArray
+from kreps.models.coordinates import CoordinateRegressions, fit_coordinates
+from kreps.models.transition import fit_regression, state_actions, state_kernel
+
+TASK = TaskSpec(3, np.array([-1.0]), np.array([1.0]))
+
+
+def samples(seed: int = 0) -> Transitions:
+    """Independent states and actions: only inputs matter here."""
+    rng = np.random.default_rng(seed)
+    return Transitions.from_rollouts(
+        [
+            Rollout(rng.uniform(-2.0, 2.0, (26, 3)), rng.uniform(-1.0, 1.0, (25, 1)), np.zeros(25))
+            for _ in range(6)
+        ]
+    )
+
+
+def smooth_and_noise(data: Transitions) -> FloatArray:
+    """A function of one column, a function of action and another one, and noise."""
+    noise = np.random.default_rng(7).normal(size=len(data))
+    first, second = data.states[:, 0], data.states[:, 1]
+    return np.stack([np.sin(2.0 * first), data.actions[:, 0] * second, 3.0 * noise], axis=1)
+
+
+def fitted(targets: FloatArray) -> tuple[CoordinateRegressions, FloatArray, FloatArray]:
+    data = samples()
+    rng = np.random.default_rng(1)
+    kernel = state_kernel(data, TASK, rng)
+    regression, errors, _, _ = fit_coordinates(data, targets, kernel, TASK, None, rng)
+    return regression, errors, state_actions(data, TASK)
+
+
+def root_mean_square(errors: FloatArray) -> FloatArray:
+    found: FloatArray = np.sqrt(np.mean(errors**2, axis=0))
+    return found
+
+
+def test_a_column_of_noise_does_not_spoil_the_others() -> None:
+    data = samples()
+    targets = smooth_and_noise(data)
+    rng = np.random.default_rng(1)
+    kernel = state_kernel(data, TASK, rng)
+    shared, _ = fit_regression(data, targets, kernel, TASK, None, rng)
+    with_one_kernel = root_mean_square(shared.leave_one_out(targets).errors)
+    regression, errors, _ = fitted(targets)
+    found = root_mean_square(errors)
+    assert (found[:2] < 0.2 * with_one_kernel[:2]).all()
+    assert found[2] < 1.1 * targets[:, 2].std()
+    assert [0] in regression.columns and [1] in regression.columns
+
+
+def test_predictions_are_those_of_the_part_of_each_column() -> None:
+    regression, errors, inputs = fitted(smooth_and_noise(samples()))
+    found = regression(inputs)
+    assert found.shape == errors.shape
+    assert sorted(j for columns in regression.columns for j in columns) == [0, 1, 2]
+    for columns, part in zip(regression.columns, regression.parts, strict=True):
+        np.testing.assert_array_equal(found[:, columns], part(inputs))
+    # in the data the regression is closer than without the sample itself
+    targets = smooth_and_noise(samples())
+    assert (root_mean_square(targets - found)[:2] <= root_mean_square(errors)[:2]).all()
+
+
+def test_equal_targets_share_one_kernel() -> None:
+    target = np.sin(samples().states[:, 0])
+    regression, errors, inputs = fitted(np.stack([target, -target], axis=1))
+    assert regression.columns == ([0, 1],)
+    found = regression(inputs)
+    np.testing.assert_allclose(found[:, 0], -found[:, 1], atol=1e-12)
+    assert errors.shape == (len(target), 2)
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_targets_that_are_zero_are_predicted_as_zero(width: int) -> None:
+    regression, errors, inputs = fitted(np.zeros((len(samples()), width)))
+    np.testing.assert_array_equal(regression(inputs), np.zeros((len(inputs), width)))
+    np.testing.assert_array_equal(errors, np.zeros((len(inputs), width)))
+
+
+def test_derivatives_are_those_of_the_predictions() -> None:
+    regression, _, inputs = fitted(smooth_and_noise(samples()))
+    points, step = inputs[:5] + 0.01, 1e-6
+    slopes = regression.jacobian(points)
+    assert slopes.shape == (5, 3, 4)
+    for j, unit in enumerate(np.eye(4)):
+        change = regression(points + step * unit) - regression(points - step * unit)
+        np.testing.assert_allclose(slopes[:, :, j], change / (2.0 * step), atol=1e-5)
