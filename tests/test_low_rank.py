@@ -37,6 +37,7 @@ from kreps.kernels.basis import KernelExpansion
 from kreps.kernels.kernel import Kernel, SquaredExponential
 from kreps.kernels.regression import KernelEmbedding
 from kreps.learning.collect import collect
+from kreps.models import coordinates
 from kreps.models.dynamics import (
     DeltaStateTargets,
     Dynamics,
@@ -70,6 +71,14 @@ STREAMED = LowRank(rank=80, above=0, subsample=200)
 
 IN_CHUNKS = Compute(chunk_size=60)
 
+
+@pytest.fixture
+def _one_kernel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One kernel for all coordinates of the dynamics, as in low rank."""
+    monkeypatch.setattr(coordinates, "MAX_ERROR_RATIO", 0.0)
+
+
+one_kernel = pytest.mark.usefixtures("_one_kernel")
 
 LIGHT: dict[str, Any] = {"model_based.improvement_steps": 1, "model_based.acceptance_rollouts": 5}
 
@@ -245,6 +254,7 @@ def assert_same_step(
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
+@one_kernel
 def test_at_full_rank_an_update_is_the_exact_one(variant: str, rollouts: list[Rollout]) -> None:
     settings = settings_for(VARIANTS[variant], FULL_VALUE)
     wanted = exact_step(rollouts, settings)
@@ -266,6 +276,7 @@ def test_commanded_actions_beyond_the_limits_are_learnt(rollouts: list[Rollout])
 
 
 @pytest.mark.parametrize("model", ["dynamics", "change", "embedding", "sample"])
+@one_kernel
 def test_terminations_have_the_same_end_in_low_rank(model: str, rollouts: list[Rollout]) -> None:
     ended = [replace(r, terminated=i % 2 == 0) for i, r in enumerate(rollouts)]
     settings = settings_for({"model": model}, FULL_VALUE)
@@ -281,12 +292,17 @@ def test_terminations_have_the_same_end_in_low_rank(model: str, rollouts: list[R
 
 
 @pytest.mark.parametrize("model", ["dynamics", "change", "embedding"])
+@one_kernel
 def test_the_model_based_step_at_full_rank_is_that_of_an_exact_update(
     model: str, rollouts: list[Rollout]
 ) -> None:
     ended = [replace(r, terminated=i % 2 == 0) for i, r in enumerate(rollouts)]
     value = replace(FULL_VALUE, angle_wrap="discontinuous")
-    settings = settings_of(model=model, value=value, **{"model_based.improvement_steps": 0})
+    settings = settings_of(
+        model=model,
+        value=value,
+        **{"model_based.improvement_steps": 0, "model_based.gradient_steps": 0},
+    )
     state, found = LearnerState(ReplayWindow(TASK, None)), []
     window = state.append(ended)
     batches: list[Any] = [

@@ -234,7 +234,7 @@ def test_the_maps_show_policy_and_value_over_the_plane(learnt: kreps.KREPS, tmp_
     assert [t.split()[-1] for t in titles] == ["mean", "deviation", "V"]
     policy, value = learnt.policy.process, learnt.value_function
     shown: list[Callable[[Any], Any]] = [
-        lambda s: np.clip(policy.mean(s)[:, 0], -30.0, 30.0),
+        lambda s: np.clip(policy.greedy(s)[:, 0], -30.0, 30.0),
         lambda s: policy.standard_deviation(s)[:, 0],
         value,
     ]

@@ -225,11 +225,27 @@ def test_compressing_does_not_change_the_policy() -> None:
     np.testing.assert_array_equal(policy.predict(query, deterministic=True)[0], before)
 
 
-def test_a_compressed_policy_cannot_be_compressed_to_fewer_centres() -> None:
-    few = Policy(fit(*samples(60, 33))).compressed(10)
-    assert few.compressed(10) is few and few.compressed(11) is few
-    with pytest.raises(ConfigurationError, match=r"10 centres.*samples.*rank=9"):
-        few.compressed(9)
+def test_a_compressed_policy_can_be_compressed_to_fewer_centres() -> None:
+    many = Policy(fit(*samples(200, 33))).compressed(80)
+    assert many.compressed(80) is many and many.compressed(81) is many
+    differences = []
+    for centres in (60, 30, 10):
+        few = many.compressed(centres).process
+        assert isinstance(few, SparseGP) and len(few.states) == centres
+        assert few.explained.shape == (centres, centres)
+        differences.append(mean_difference(many, Policy(few)))
+        query = np.random.default_rng(centres).normal(size=(50, 2))
+        variance = (few.standard_deviation(query) / TASK.action_scale) ** 2
+        assert (variance >= few.noise * (1.0 - 1e-9)).all()
+        assert (variance <= (few.signal + few.noise) * (1.0 + 1e-9)).all()
+    assert differences[0] < 0.2 * differences[2] and differences == sorted(differences)
+    # nearly all centres: nearly the same policy, also its noise
+    close = many.compressed(79).process
+    assert isinstance(close, SparseGP) and isinstance(many.process, SparseGP)
+    states = many.process.states
+    np.testing.assert_allclose(
+        close.standard_deviation(states), many.process.standard_deviation(states), rtol=1e-2
+    )
 
 
 @pytest.mark.parametrize("centres", [0, -3, 2.5, "ten", None, np.array([3, 4])])

@@ -232,7 +232,7 @@ def test_the_policy_is_the_weighted_gaussian_process_of_the_commanded_actions() 
     c = signal * kernel.gram(states) + noise * np.diag(1.0 / weights)
     k = signal * kernel.gram(states, query)
     np.testing.assert_allclose(
-        state.policy.mean(query), 2.0 * k.T @ np.linalg.solve(c, commanded), rtol=1e-6, atol=1e-8
+        state.policy.greedy(query), 2.0 * k.T @ np.linalg.solve(c, commanded), rtol=1e-6, atol=1e-8
     )
     variance = signal - np.einsum("ij,ij->j", k, np.linalg.solve(c, k)) + noise
     np.testing.assert_allclose(
@@ -275,7 +275,7 @@ def test_fits_start_where_those_of_the_last_update_ended() -> None:
 def test_the_new_policy_pushes_towards_the_origin() -> None:
     state, _ = run(collect(20, 15, seed=5))
     assert state.policy is not None
-    left, right = state.policy.mean(np.array([[-1.0, 0.0], [1.0, 0.0]]))[:, 0]
+    left, right = state.policy.greedy(np.array([[-1.0, 0.0], [1.0, 0.0]]))[:, 0]
     assert left > 0.1
     assert right < -0.1
 

@@ -59,6 +59,7 @@ MODEL_BASED: dict[str, Any] = {
     "model_based.acceptance_rollouts": 50,
     "model_based.exploration_bonus": 0.1,
     "model_based.improvement_steps": 20,
+    "model_based.gradient_steps": 40,
     "model_based.max_samples": 20_000,
 }
 SINGLE_STEP: dict[str, Any] = {

@@ -113,7 +113,7 @@ def checkpoint_settings(stored: Mapping[str, Any], method: str) -> dict[str, Any
         return present_settings(stored)
     settings = {**present_settings({**ADDED_IN_0_1, **stored}), **NOT_IN_0_1}
     if settings.get("model_based", True) is not None:
-        settings["model_based.improvement_steps"] = 0
+        settings["model_based.improvement_steps"] = settings["model_based.gradient_steps"] = 0
     return settings
 
 

@@ -200,7 +200,10 @@ def ascended(
     returns: FloatArray,
     comparison: ModelComparison,
 ) -> tuple[GeneratedStep, FloatArray]:
-    """The policy of a step after gradient ascent, if its returns (rollouts,) are larger."""
+    """The policy of a step after gradient ascent, if its returns (rollouts,) are larger.
+
+    They are compared on other starts and noise than those of the ascent.
+    """
     model_based, policy = batch.settings.model_based, best.policy.policy
     assert model_based is not None
     assert isinstance(policy, CostSensitiveGP | SparseGP)

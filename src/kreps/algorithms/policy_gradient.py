@@ -47,6 +47,10 @@ RIDGE, JITTER = 1e-3, 1e-9
 """Of the metric: weight of the squared RKHS norm of a change, relative to its mean square in the
 visited states, and what is added for a stable factorisation."""
 
+GRADIENT = 1
+"""Second part of the seed of the rollouts of the ascent: other starts and noise than those by which
+its result is compared, so that a gain on these alone is not taken for one."""
+
 MAX_METRIC_STATES = 1_000
 """Largest number of visited states from which a direction is computed."""
 
@@ -123,7 +127,7 @@ def improve(
     """
     best = policy.predictor if isinstance(policy, CostSensitiveGP) else policy
     env = comparison.from_starts
-    rng = np.random.default_rng(comparison.seed)
+    rng = np.random.default_rng((comparison.seed, GRADIENT))
     ascent = Ascent(comparison, FixedNoise.of_policy(env, best, comparison.rollouts, rng))
     value, record, rewards = ascent.evaluate(best)
     direction, size = ascent.direction(best, record, rewards), FIRST_STEP

@@ -88,7 +88,7 @@ class KernelExpansion:
         known, alpha = like(self.coordinates, states), like(self.alpha, states)
         batches = [
             gaussian_gram(known, self.kernel.embed(states[i : i + PREDICTION_BATCH])).T @ alpha
-            for i in range(0, max(len(states), 1), PREDICTION_BATCH)
+            for i in range(0, max(states.shape[0], 1), PREDICTION_BATCH)
         ]
         return batches[0] if len(batches) == 1 else namespace(states).concat(batches, axis=0)
 

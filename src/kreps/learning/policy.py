@@ -165,7 +165,7 @@ class Policy:
             A policy with the same address of its noise, or this policy if it has no more centres.
 
         Raises:
-            ConfigurationError: fewer than one centre, or a policy without samples.
+            ConfigurationError: fewer than one centre, or the policy is no Gaussian process.
         """
         try:
             count = operator.index(centres)
@@ -178,17 +178,10 @@ class Policy:
                 f"centres = {count}, but at least one is needed; 50 are often enough"
             )
         process = self.process
-        if isinstance(process, CostSensitiveGP):
-            return Policy(process.compressed(count), self.seed, self.iteration)
-        if not isinstance(process, SparseGP):
+        if not isinstance(process, CostSensitiveGP | SparseGP):
             raise ConfigurationError(_no_process(process, "compress"))
-        if len(process.states) > count:
-            raise ConfigurationError(
-                f"the policy has {len(process.states)} centres and does not keep its samples, so "
-                f"it cannot be compressed to {count}; compress the exact policy, or learn with "
-                f"low_rank=kreps.LowRank(rank={count})"
-            )
-        return self
+        few = process.compressed(count)
+        return self if few is process else Policy(few, self.seed, self.iteration)
 
     @default_errstate()
     def extrapolation(self, rollouts: Iterable[Rollout]) -> Extrapolation:

@@ -13,15 +13,11 @@ from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.linalg import Cholesky, cholesky, inverse_lower
-from kreps.policies.sparse_gp import PolicySums, SparseGP
+from kreps.policies.sparse_gp import MIN_RESIDUAL, PolicySums, SparseGP
 
 MAX_SUPPORT = 6_000
 """Largest number of support points of an exact policy.  Memory grows with its square (288 MB for
 one matrix), time with its cube."""
-
-MIN_RESIDUAL = 1e-12
-"""Squared kernel residual of a support point below which it never becomes another centre.  Smaller
-residuals are dominated by rounding."""
 
 MAX_RESIDUAL_RATIO = 1e-4
 """Largest part of a support point's prior variance that the centres may leave out, as a share of

@@ -2,7 +2,8 @@
 
 It is made from an exact process, with as many centres as its noise requires
 (`CostSensitiveGP.predictor`) or with a given number (`CostSensitiveGP.compressed`), or from sums
-over any number of samples (`SparseGP.fit`).
+over any number of samples (`SparseGP.fit`).  Steps by the gradient of the return change its mean
+(`kreps.algorithms.policy_gradient`).
 """
 
 from __future__ import annotations
@@ -17,6 +18,10 @@ from kreps.kernels.arrays import Array, FloatArray, as_numpy, namespace
 from kreps.kernels.basis import KernelExpansion, RKHSBasis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.linalg import solve_lower_transposed
+
+MIN_RESIDUAL = 1e-12
+"""Squared kernel residual of a point below which it never becomes another centre.  Smaller
+residuals are dominated by rounding."""
 
 TRIANGULAR_BLOCK_ROWS = 128
 """Rows of a triangular matrix that are multiplied at once, without the zeros to their right."""
@@ -113,6 +118,26 @@ class SparseGP:
             explained=self.explained / std_scale,
             signal=self.signal / std_scale**2,
             noise=self.noise / std_scale**2,
+        )
+
+    def compressed(self, centres: int) -> SparseGP:
+        """This policy on at most ``centres`` of its centres.
+
+        With ``k(s) = Z z(s)`` up to what fewer centres cannot represent, the mean is fitted to that
+        at all centres by least squares, and the explained variance is ``|explained Z z(s)|^2``.
+        """
+        if centres >= len(self.states):
+            return self
+        basis, features = RKHSBasis.fit(
+            self.kernel, self.states, tolerance=MIN_RESIDUAL, max_rank=centres
+        )
+        theta = np.linalg.lstsq(features, self.scaled_mean(self.states), rcond=None)[0]
+        explained = np.linalg.qr(self.explained @ features, mode="r")
+        return replace(
+            self,
+            states=basis.pivots,
+            mean_weights=np.ascontiguousarray(solve_lower_transposed(basis.lower, theta)),
+            explained=np.ascontiguousarray(solve_lower_transposed(basis.lower, explained.T).T),
         )
 
     @cached_property
