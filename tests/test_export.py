@@ -147,7 +147,7 @@ def test_a_model_of_a_learnt_policy_computes_what_the_policy_computes(
 ) -> None:
     rng, policy = np.random.default_rng(4), learnt[seed]
     at = np.stack([rng.uniform(-np.pi, 2 * np.pi, 2000), rng.uniform(-15.0, 15.0, 2000)], axis=1)
-    assert isinstance(policy.process, CostSensitiveGP)
+    assert isinstance(policy.process, CostSensitiveGP | SparseGP)
     at = np.concatenate([at, policy.process.states])
     if centres is not None:
         policy = policy.compressed(centres)
@@ -171,7 +171,7 @@ def test_compressed_policies_are_computed_in_single_precision(
 def test_weights_beyond_single_precision_are_computed_in_double(tmp_path: Path) -> None:
     """With little noise, weights are huge and of alternating sign."""
     policy, at = random_policy(TASKS["plain"], 300, 1e-4), states_of(TASKS["plain"], 300, 5)
-    assert isinstance(policy.process, CostSensitiveGP)
+    assert isinstance(policy.process, CostSensitiveGP | SparseGP)
     bound = export.single_precision_error(policy.process.predictor)
     assert bound > 1e-4
     assert policy.export_onnx(tmp_path / "x.onnx", "float32") == "float64"
@@ -189,7 +189,7 @@ def test_the_error_of_single_precision_is_near_its_bound(
     ]
     shares = []
     for policy in policies:
-        assert isinstance(policy.process, CostSensitiveGP)
+        assert isinstance(policy.process, CostSensitiveGP | SparseGP)
         at = np.concatenate([policy.process.states, states_of(policy.process.task, 1000, 6)])
         wide = TaskSpec(  # so that no clipping hides an error
             policy.process.task.observation_size,

@@ -424,6 +424,7 @@ OUT_OF_RANGE: dict[str, list[Any]] = {
     "model_based.acceptance_rollouts": [-1, 1, 2.5, 4.0, "4", None, True],
     "model_based.exploration_bonus": [-0.1, *NOT_FINITE, *NO_NUMBERS],
     "model_based.improvement_steps": [value for value in NO_COUNTS if value != 0],
+    "model_based.gradient_steps": [value for value in NO_COUNTS if value != 0],
     "model_based.max_samples": NO_COUNTS,
 }
 
@@ -465,6 +466,7 @@ TOO_FAR: dict[str, list[Any]] = {
     "model_based.acceptance_rollouts": [100_001, 10**9],
     "model_based.exploration_bonus": [],
     "model_based.improvement_steps": [100_001],
+    "model_based.gradient_steps": [100_001],
     "model_based.max_samples": [10_000_001],
 }
 """Besides whole numbers of 400 and of 5000 digits."""
@@ -531,6 +533,7 @@ AT_THE_EDGE: dict[str, list[Any]] = {
     "model_based.acceptance_rollouts": [0, 2],
     "model_based.exploration_bonus": [0, 10.0],
     "model_based.improvement_steps": [0, 1],
+    "model_based.gradient_steps": [0, 1],
     "growth": [0, 0.5],
 }
 

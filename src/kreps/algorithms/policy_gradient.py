@@ -21,12 +21,14 @@ from kreps.kernels.arrays import FloatArray
 from kreps.kernels.linalg import cholesky, with_diagonal
 from kreps.models.model_env import step_shares
 from kreps.models.return_gradient import (
+    TINY,
     FixedNoise,
     Pessimism,
     RolloutRecord,
     StepRewards,
     action_gradient,
     average_return,
+    limited,
     roll_out,
 )
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
@@ -104,14 +106,16 @@ def natural_direction(
         gradient: (m, da) derivatives of the return by the actions there.
         weights: (m,) of the states, which sum to one.
     """
-    length = np.linalg.norm(gradient, axis=1) / np.maximum(weights, 1e-12)
-    limit = MAX_RELATIVE_GRADIENT * float(weights @ length)
-    gradient = gradient * np.minimum(1.0, limit / np.maximum(length, 1e-300))[:, None]
+    lengths = np.linalg.norm(gradient, axis=1)
+    # in a state of no weight there is no gradient
+    relative = np.divide(lengths, weights, out=np.zeros_like(lengths), where=weights > 0.0)
+    limit = MAX_RELATIVE_GRADIENT * float(lengths.sum())
+    gradient = limited(gradient, relative, max(limit, TINY))
     k = policy.kernel_values(states)
     metric = k.T @ (weights[:, None] * k) + RIDGE * policy.kernel.gram(policy.states)
     found = cholesky(with_diagonal(metric, JITTER)).solve(k.T @ gradient)
     change = np.sqrt(weights @ np.sum((k @ found) ** 2, axis=1))
-    direction: FloatArray = found / max(change, 1e-300)
+    direction: FloatArray = found / max(change, TINY)
     return direction
 
 
@@ -125,14 +129,15 @@ def improve(
         policy: from which the ascent starts.
         steps: that are tried.
     """
-    best = policy.predictor if isinstance(policy, CostSensitiveGP) else policy
+    best = _in_row_order(policy.predictor if isinstance(policy, CostSensitiveGP) else policy)
     env = comparison.from_starts
     rng = np.random.default_rng((comparison.seed, GRADIENT))
     ascent = Ascent(comparison, FixedNoise.of_policy(env, best, comparison.rollouts, rng))
     value, record, rewards = ascent.evaluate(best)
     direction, size = ascent.direction(best, record, rewards), FIRST_STEP
     for _ in range(steps):
-        trial = replace(best, mean_weights=best.mean_weights + size * direction)
+        weights = np.ascontiguousarray(best.mean_weights + size * direction)
+        trial = replace(best, mean_weights=weights)
         new_value, record, rewards = ascent.evaluate(trial)
         if new_value > value:
             best, value, size = trial, new_value, LARGER * size
@@ -142,3 +147,13 @@ def improve(
         if size < SMALLEST_STEP:
             break
     return best
+
+
+def _in_row_order(policy: SparseGP) -> SparseGP:
+    """The same policy with its arrays as they are read from a file, so that it rounds alike."""
+    return replace(
+        policy,
+        states=np.ascontiguousarray(policy.states),
+        mean_weights=np.ascontiguousarray(policy.mean_weights),
+        explained=np.ascontiguousarray(policy.explained),
+    )

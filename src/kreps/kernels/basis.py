@@ -86,11 +86,15 @@ class KernelExpansion:
     @default_errstate()
     def __call__(self, states: Array) -> Array:
         known, alpha = like(self.coordinates, states), like(self.alpha, states)
+        count = states.shape[0]
+        if count <= PREDICTION_BATCH:
+            return gaussian_gram(known, self.kernel.embed(states)).T @ alpha
         batches = [
-            gaussian_gram(known, self.kernel.embed(states[i : i + PREDICTION_BATCH])).T @ alpha
-            for i in range(0, max(states.shape[0], 1), PREDICTION_BATCH)
+            states[i : min(i + PREDICTION_BATCH, count), :]
+            for i in range(0, count, PREDICTION_BATCH)
         ]
-        return batches[0] if len(batches) == 1 else namespace(states).concat(batches, axis=0)
+        values = [gaussian_gram(known, self.kernel.embed(batch)).T @ alpha for batch in batches]
+        return namespace(states).concat(values, axis=0)
 
     @default_errstate()
     def jacobian(self, states: FloatArray) -> FloatArray:

@@ -96,11 +96,12 @@ def fit_coordinates(
     shared, x = fit_regression(data, targets, state_kernel, task, start, rng)
     errors = shared.leave_one_out(targets).errors
     own: dict[int, KernelExpansion] = {}
+    of_own = rng.spawn(1)[0]  # so that all else of an update has the same random numbers as before
     jitter = shared.factor.jitter
     for j in np.flatnonzero(targets.any(axis=0)) if targets.shape[1] > 1 else ():
         target = targets[:, [j]]
         kernel, regulariser, _ = embedding_hyperparameters(
-            inputs, target, state_kernel, task, None, rng, (x,), LOG_LENGTHSCALE_STD
+            inputs, target, state_kernel, task, None, of_own, (x,), LOG_LENGTHSCALE_STD
         )
         model = PivotedEmbedding.fit(kernel, inputs, regulariser)
         single = model or KernelEmbedding.fit(kernel, inputs, regulariser)

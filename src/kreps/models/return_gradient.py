@@ -26,6 +26,9 @@ from kreps.models.model_env import ModelEnv, RolloutNoise, step_shares
 from kreps.models.reward_model import RewardModel
 from kreps.policies.sparse_gp import SparseGP
 
+TINY = 1e-100
+"""Smallest limit of derivatives: that of a reward which is the same everywhere would be zero."""
+
 
 @dataclass(frozen=True)
 class RolloutRecord:
@@ -213,9 +216,8 @@ def action_gradient(
     gradient = np.zeros_like(record.commanded)
     by_state, by_alive = np.zeros((count, size)), np.zeros(count)
     for t in range(steps - 1, -1, -1):
-        length = np.linalg.norm(by_state * scale, axis=1)
-        by_state *= np.minimum(1.0, limits[t] / np.maximum(length, 1e-300))[:, None]
-        by_state *= inside[t]
+        lengths = np.linalg.norm(by_state * scale, axis=1)
+        by_state = inside[t] * limited(by_state, lengths, limits[t])
         earned = shares[t] * record.alive[t]
         by_termination = earned * reward_by_termination[t] - record.alive[t] * by_alive
         by_state += by_termination[:, None] * of_termination[t]
@@ -229,6 +231,12 @@ def action_gradient(
         through_policy = np.where(clipped, 0.0, by_action)
         by_state = by_input[:, :size] + np.einsum("ma,mas->ms", through_policy, of_policy[t])
     return gradient
+
+
+def limited(vectors: FloatArray, lengths: FloatArray, limit: float) -> FloatArray:
+    """Vectors (m, k) of given lengths (m,), scaled down where these are above a limit."""
+    factors = np.divide(limit, lengths, out=np.ones_like(lengths), where=lengths > limit)
+    return vectors * factors[:, None]
 
 
 def _termination_slopes(env: ModelEnv, record: RolloutRecord) -> FloatArray:
@@ -256,7 +264,7 @@ def _adjoint_limits(
     if of_termination.any():
         lost = np.abs(values - env.end_reward).mean() / (4.0 * env.restart_probability)
         typical += lost * _root_mean_square(of_termination * scale)
-    limits: FloatArray = typical * np.cumsum(shares[::-1])[::-1]
+    limits: FloatArray = max(typical, TINY) * np.cumsum(shares[::-1])[::-1]
     return limits
 
 

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from kreps.data.task import TaskSpec
-from kreps.kernels.arrays import Array, FloatArray, as_numpy, namespace
+from kreps.kernels.arrays import Array, FloatArray, as_float, as_numpy, namespace
 from kreps.kernels.basis import KernelExpansion, RKHSBasis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.linalg import solve_lower_transposed
@@ -132,7 +132,7 @@ class SparseGP:
             self.kernel, self.states, tolerance=MIN_RESIDUAL, max_rank=centres
         )
         theta = np.linalg.lstsq(features, self.scaled_mean(self.states), rcond=None)[0]
-        explained = np.linalg.qr(self.explained @ features, mode="r")
+        explained = as_float(np.linalg.qr(self.explained @ features, mode="r"))
         return replace(
             self,
             states=basis.pivots,
