@@ -613,8 +613,9 @@ def test_export_says_what_compression_costs(run: Path, tmp_path: Path) -> None:
     off = [p.predict(states, deterministic=True)[0] for p in (exact, few)]
     rms = np.sqrt(np.mean(((off[0] - off[1]) / 30.0) ** 2))
     assert f"changes by {rms:.2g} of its scale" in text
-    text = call("export", run, "--centres", "5000", "--out", out)[1]
+    text = call("export", run, "--centres", str(len(states) - 1), "--out", out)[1]
     assert "changes by" in text and "take more centres" not in text
+    assert "changes by" not in call("export", run, "--centres", "5000", "--out", out)[1]
 
 
 def test_export_without_centres_copies_a_policy(run: Path, tmp_path: Path) -> None:

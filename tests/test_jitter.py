@@ -109,11 +109,11 @@ def test_an_update_reports_the_largest_jitter(settings: dict[str, Any], count: i
     samples, state = batch(**settings)
     step = reps_step(samples, state, 0.05, np.random.default_rng(2))
     assert samples.jitters == [0.0] * count
-    assert report(samples, step, None, None).jitter == 0.0
+    assert report(samples, step, None, None, None).jitter == 0.0
     samples.jitters += [1e-9, 3e-7, 2e-8]
-    assert report(samples, step, None, None).jitter == 3e-7
+    assert report(samples, step, None, None, None).jitter == 3e-7
     larger = replace(step, dual=replace(step.dual, jitter=1e-6))
-    assert report(samples, larger, None, None).jitter == 1e-6
+    assert report(samples, larger, None, None, None).jitter == 1e-6
 
 
 def test_an_exact_update_takes_note_of_the_jitter_of_its_policy() -> None:

@@ -378,14 +378,15 @@ def test_stochastic_prediction_has_the_moments_of_the_policy(learnt: kreps.KREPS
 
 def test_stochastic_prediction_differs_from_call_to_call(learnt: kreps.KREPS) -> None:
     policy = learnt.policy
-    # most of them may be equal, as they are clipped
-    actions = [float(policy.predict([np.pi, 0.0])[0][0]) for _ in range(300)]
-    assert len(set(actions)) > 3
+    # many may be equal, as they are clipped; at the second state the force is near its middle
+    for state in ([np.pi, 0.0], [0.0, 0.0]):
+        actions = [float(policy.predict(state)[0][0]) for _ in range(300)]
+        assert len(set(actions)) > 1
 
 
 def test_predict_of_the_learner_differs_from_call_to_call_too(learnt: kreps.KREPS) -> None:
     actions = [float(learnt.predict([np.pi, 0.0])[0][0]) for _ in range(300)]
-    assert len(set(actions)) > 3
+    assert len(set(actions)) > 1
 
 
 @dataclass(frozen=True)
