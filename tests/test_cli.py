@@ -623,17 +623,29 @@ def test_export_without_centres_copies_a_policy(run: Path, tmp_path: Path) -> No
     assert (tmp_path / "x.safetensors").read_bytes() == (run / "policy.safetensors").read_bytes()
 
 
+def test_export_writes_c_source(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    code, text = call("export", run, "--centres", "5", "--to", "c", "--dtype", "float32")
+    assert code == 0 and "wrote policy.c: C source, beside its header policy.h" in text
+    assert call("export", run, "--centres", "5", "--out", "arm.c")[0] == 0
+    assert "float policy_number;" in (tmp_path / "policy.h").read_text()
+    assert "int arm_act(" in (tmp_path / "arm.c").read_text()
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--out", "x.tflite"], ".onnx or .safetensors"),
-        (["--out", "x"], ".onnx or .safetensors"),
-        ([], "--out"),
+        (["--out", "x.tflite"], "'tflite' is no format of a policy; choose one of onnx, c, safe"),
+        (["--out", "x"], "choose one of onnx, c, safetensors"),
+        (["--to", "rust"], "choose one of onnx, c, safetensors"),
+        (["--to", "c", "--out", "x.onnx"], "x.onnx does not end in .c"),
+        (["--out", "my-arm.c"], "such as arm_policy.c"),
+        ([], "write --out policy.onnx"),
         (["--out", "x.onnx", "--centres", "0"], "--centres"),
         (["--out", "x.onnx", "--centres", "few"], "--centres"),
         (["--out", "x.onnx", "--dtype", "float16"], "float64, float32"),
         (["--out", "x.onnx", "--dtype", ""], "float64, float32"),
-        (["--out", "x.safetensors", "--dtype", "float32"], "write an .onnx file"),
+        (["--out", "x.safetensors", "--dtype", "float32"], "write an .onnx or .c file"),
         (["--out", "missing/x.onnx"], "cannot write missing/x.onnx"),
         (["--out", "missing/x.safetensors"], "cannot write missing/x.safetensors"),
         (["--out", "run/policy.safetensors", "--centres", "5"], "choose another name"),

@@ -18,6 +18,7 @@ from kreps.intake import as_flags, as_numbers
 from kreps.kernels.arrays import FloatArray, IntArray, default_errstate
 from kreps.learning import storage
 from kreps.learning.extrapolation import Extrapolation, extrapolation_of
+from kreps.learning.storage.c_source import write_c
 from kreps.learning.storage.onnx import write_onnx
 from kreps.policies.base import LearntPolicy
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
@@ -231,12 +232,46 @@ class Policy:
                 policy is no Gaussian process.
             StorageError: the file cannot be written.
         """
+        return write_onnx(self._sparse(), path, dtype)
+
+    @default_errstate()
+    def export_c(self, path: str | Path, dtype: str = "float64") -> str:
+        """Write C99 source of the policy without exploration, for controllers without a library.
+
+        Beside ``NAME.c`` is its header, ``NAME.h``.  The function ``NAME_act`` gives the mean
+        action (da,), clipped to the task's limits, from the observation (do,), both in the task's
+        units (docs/export.md).  A policy that needs earlier steps also has ``lags``, an array of
+        h do + k da numbers, which ``NAME_start`` sets at the start of an episode and ``NAME_act``
+        updates: once per decision, not per control period (docs/delays.md).
+
+        Args:
+            path: such as ``arm_policy.c``; the folder must exist.
+            dtype: "float64" for ``double`` or "float32" for ``float``, of arguments and results.
+                The arithmetic is of the same type, unless float32 could change the mean by 1e-5 of
+                the action scale; then it is in ``double``.
+
+        Returns:
+            The dtype of the arithmetic.
+
+        Raises:
+            ConfigurationError: the policy is no Gaussian process, or the name of the file cannot
+                begin the name of a function.
+            StorageError: a file cannot be written.
+        """
+        return write_c(self._sparse(), path, dtype)
+
+    def _sparse(self) -> SparseGP:
+        """The process on few centres, as it is exported.
+
+        Raises:
+            ConfigurationError: this is no Gaussian process.
+        """
         process = self.process
         if isinstance(process, CostSensitiveGP):
             process = process.predictor
         if not isinstance(process, SparseGP):
             raise ConfigurationError(_no_process(process, "export"))
-        return write_onnx(process, path, dtype)
+        return process
 
 
 def _no_process(process: LearntPolicy, verb: str) -> str:

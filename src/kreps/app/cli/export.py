@@ -17,11 +17,12 @@ from kreps.learning.policy import Policy, load_policy, mean_difference
 EXPORT_EXAMPLES = (
     "kreps export runs/swing-up --out policy.onnx",
     "kreps export runs/swing-up --centres 50 --dtype float32 --out policy.onnx",
+    "kreps export runs/swing-up --centres 50 --to c",
     "kreps export runs/swing-up/policy.safetensors --centres 50 --out small.safetensors",
 )
 
-SUFFIXES = (".onnx", ".safetensors")
-"""File names that `export` writes."""
+FORMATS = ("onnx", "c", "safetensors")
+"""What `export` writes, and the end of its file's name."""
 
 MAX_COMPRESSION_ERROR = 0.02
 """Root-mean-square error of a compressed policy, in units of the action scale, above which there
@@ -39,36 +40,61 @@ def export(
         ),
     ],
     out: Annotated[
-        Path,
-        typer.Option(help="An .onnx file, or a .safetensors file for kreps.load_policy.", **PATH),
-    ],
+        Path | None,
+        typer.Option(
+            help="File to write; policy.onnx, policy.c or policy.safetensors if not given.", **PATH
+        ),
+    ] = None,
+    to: Annotated[
+        str | None,
+        typer.Option(help="onnx, c or safetensors; if not given, as the name of --out ends."),
+    ] = None,
     centres: Annotated[
         int | None,
         typer.Option(min=1, help="Compress to at most so many support points; all if not given."),
     ] = None,
     dtype: Annotated[
-        str, typer.Option(help="float64 or float32, of an ONNX model's input and outputs.")
+        str, typer.Option(help="float64 or float32, of the input and outputs of ONNX and C.")
     ] = "float64",
 ) -> None:
-    """Write the policy for a controller: as an ONNX model, or compressed.
+    """Write the policy for a controller: as an ONNX model, as C99 source, or compressed.
 
     A model needs no Python on the robot.  Its input is [bold]observation[/bold] (batch, ds).  Its
     outputs are [bold]action[/bold] (batch, da), without exploration and within the limits, and
     [bold]standard_deviation[/bold] (batch, da).  It needs: pip install 'kreps\\[onnx]'.
+
+    C source has a function [bold]policy_act(observation, action)[/bold], or another name in place
+    of "policy" if the file has another name.  It computes the same action without a library, and
+    allocates no memory.
     """
-    if out.suffix not in SUFFIXES:
-        raise ConfigurationError(
-            f"--out {out} is not the name of a policy; end it in {' or '.join(SUFFIXES)}"
-        )
+    out, to = _target(out, to)
     file = _policy_file(source)
     policy = load_policy(file)
     if centres is not None:
         policy = _compressed(policy, centres)
-    if out.suffix == ".onnx":
-        kind = _write_model(policy, out, dtype)
-    else:
+    if to == "safetensors":
         kind = _write_policy(policy, out, dtype, file)
+    else:
+        kind = _write_model(policy, out, to, dtype)
     say(f"wrote {out}: {kind}, {out.stat().st_size / 1e3:.0f} kB")
+
+
+def _target(out: Path | None, to: str | None) -> tuple[Path, str]:
+    """The file to write and its format, of which one may be left out."""
+    if out is None and to is None:
+        raise ConfigurationError("--out and --to are both missing; write --out policy.onnx")
+    if to is None:
+        assert out is not None
+        to = out.suffix.removeprefix(".")
+    if to not in FORMATS:
+        raise ConfigurationError(
+            f"{to!r:.40} is no format of a policy; choose one of {', '.join(FORMATS)} by --to, "
+            "or by the end of the name of --out"
+        )
+    out = out or Path(f"policy.{to}")
+    if out.suffix != f".{to}":
+        raise ConfigurationError(f"--out {out} does not end in .{to}; leave --to out, or rename it")
+    return out, to
 
 
 def _policy_file(source: Path) -> Path:
@@ -98,9 +124,13 @@ def _compressed(policy: Policy, centres: int) -> Policy:
     return compressed
 
 
-def _write_model(policy: Policy, out: Path, dtype: str) -> str:
-    arithmetic = policy.export_onnx(out, dtype)
-    kind = f"a model with {arithmetic} arithmetic"
+def _write_model(policy: Policy, out: Path, to: str, dtype: str) -> str:
+    write, noun = {
+        "onnx": (policy.export_onnx, "a model"),
+        "c": (policy.export_c, f"C source, beside its header {out.stem}.h,"),
+    }[to]
+    arithmetic = write(out, dtype)
+    kind = f"{noun} with {arithmetic} arithmetic"
     if dtype == "float32" != arithmetic:
         kind += " (with so many centres float32 is not accurate enough; try --centres 50)"
     return kind
@@ -110,7 +140,7 @@ def _write_policy(policy: Policy, out: Path, dtype: str, source: Path) -> str:
     if dtype != "float64":
         raise ConfigurationError(
             f"--dtype {dtype}, but .safetensors files of kreps hold float64 only; leave it "
-            "out, or write an .onnx file"
+            "out, or write an .onnx or .c file"
         )
     if os.path.realpath(out) == os.path.realpath(source):
         raise ConfigurationError(

@@ -1,10 +1,6 @@
 """Policies as ONNX models, which give mean and standard deviation of the actions without Python.
 
-A model computes the same as `SparseGP`.  Kernel values are computed from differences of
-coordinates, not from inner products as in `kreps.kernels.gram.gaussian_gram`: inner products are
-faster in large batches, but their rounding errors in the exponent are up to ``|e|^2`` times as
-large.  In single precision that would be too much, as weights are large, of alternating sign, and
-multiply each error of a kernel value.
+A model computes the same as `SparseGP`, with the numbers of `kreps.learning.storage.exported`.
 """
 
 from __future__ import annotations
@@ -16,27 +12,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from kreps.errors import ConfigurationError
-from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Factor, Periodic, SmoothedImage, SquaredExponential, smoothing
 from kreps.learning.storage.atomic import write_atomically
 from kreps.learning.storage.checksum import BLANK, NAME, sealed
-from kreps.learning.storage.onnx_graph import Graph, Number
-from kreps.learning.storage.onnx_lags import add_next_lags, add_state, has_lags, lags_size
+from kreps.learning.storage.exported import (
+    DTYPES,
+    SINGLE_PRECISION_TOLERANCE,
+    Number,
+    arithmetic_of,
+    coordinates_of,
+    has_lags,
+    inwards,
+    lags_size,
+)
+from kreps.learning.storage.exported import single_precision_error as single_precision_error
+from kreps.learning.storage.onnx_graph import Graph
+from kreps.learning.storage.onnx_lags import add_next_lags, add_state
 from kreps.policies.sparse_gp import SparseGP
 
 OPSET, IR_VERSION = 17, 8
 """Versions of 2022, so that older runtimes on robots can read a model."""
 
-DTYPES: dict[str, Number] = {"float64": np.float64, "float32": np.float32}
-
 GUARD = "observation_or_action_is_not_finite"
 """Name of the node that fails if a number is NaN or infinite."""
-
-SINGLE_PRECISION_TOLERANCE = 1e-4
-"""Largest error of the mean that single precision may cause, in units of the action scale."""
 
 
 def write_onnx(
@@ -73,20 +73,14 @@ def write_onnx(
             too large for it.
         StorageError: the file cannot be written.
     """
-    if dtype not in tuple(DTYPES):  # a tuple, as dtype may not be hashable
-        raise ConfigurationError(
-            f"dtype = {dtype!r:.40}, but a model is computed in one of {', '.join(DTYPES)}"
-        )
+    arithmetic = arithmetic_of(policy, dtype, tolerance)
     try:
         import onnx
     except ImportError as error:
         raise ConfigurationError(
             f"writing {path} needs ONNX, which is not installed: pip install 'kreps[onnx]'"
         ) from error
-    single = single_precision_error(policy) <= tolerance
-    arithmetic = dtype if single else "float64"
-    with np.errstate(over="ignore"):  # `Graph.constant` raises an error with the name
-        graph = _graph_of(policy, onnx.helper, DTYPES[dtype], DTYPES[arithmetic])
+    graph = _graph_of(policy, onnx.helper, DTYPES[dtype], DTYPES[arithmetic])
     model = onnx.helper.make_model(
         graph,
         opset_imports=[onnx.helper.make_opsetid("", OPSET)],
@@ -101,18 +95,6 @@ def write_onnx(
     onnx.helper.set_model_props(model, {"kreps": _note(policy, arithmetic), NAME: BLANK})
     write_atomically(path, sealed(model.SerializeToString(deterministic=True)))
     return arithmetic
-
-
-def single_precision_error(policy: SparseGP) -> float:
-    """Upper estimate of the error of the mean in single precision, in units of the action scale.
-
-    The relative error of a kernel value ``k_j`` is a few times 2^-24.  The error of the mean is
-    then that much of ``sum_j k_j |w_j|``, which is largest near the centres.  Measured errors were
-    less than half of this estimate.
-    """
-    k = policy.kernel.gram(policy.states)
-    magnitude = float((k @ np.abs(policy.mean_weights)).max(initial=0.0))
-    return 2.0 * float(np.finfo(np.float32).eps) * magnitude
 
 
 def _note(policy: SparseGP, arithmetic: str) -> str:
@@ -146,7 +128,7 @@ def _graph_of(policy: SparseGP, helper: Any, border: Number, arithmetic: Number)
     commanded, deviation = _mean_and_deviation(graph, policy, state, border)
     zero = _zero_if_finite(graph, (*inputs, commanded, deviation), border)
     low, high = (
-        graph.constant(name, _inwards(limit, task.action_centre, border), border)
+        graph.constant(name, inwards(limit, task.action_centre, border), border)
         for name, limit in (("action_low", task.action_low), ("action_high", task.action_high))
     )
     action = graph.node("Min", graph.node("Max", commanded, low), high)
@@ -206,21 +188,17 @@ def _zero_if_finite(graph: Graph, values: Sequence[str], border: Number) -> str:
 
 def _kernel_values(graph: Graph, policy: SparseGP, state: str) -> str:
     """``k(state, centres)``, (batch, r)."""
-    kernel, states = policy.kernel, policy.states
-    parts = [factor.coordinates(states) for factor in kernel.factors]
-    raw = np.concatenate(parts, axis=1)
-    # The same rounded origin is subtracted from states and centres, before the division by
-    # lengthscales: differences near the centres then keep all digits, wherever the centres lie.
-    origin = raw.mean(axis=0).astype(graph.dtype)
-    per_length = 1.0 / np.repeat(kernel.lengthscales, [part.shape[1] for part in parts])
+    scaled = coordinates_of(policy, graph.dtype)
     found = [
-        _coordinates(graph, factor, state, f"factor_{i}") for i, factor in enumerate(kernel.factors)
+        _coordinates(graph, factor, state, f"factor_{i}")
+        for i, factor in enumerate(policy.kernel.factors)
     ]
     coordinates = graph.node("Concat", *found, axis=1)
-    coordinates = graph.node("Sub", coordinates, graph.constant("origin", origin))
-    coordinates = graph.node("Mul", coordinates, graph.constant("per_lengthscale", per_length))
+    coordinates = graph.node("Sub", coordinates, graph.constant("origin", scaled.origin))
+    per_length = graph.constant("per_lengthscale", scaled.per_lengthscale)
+    coordinates = graph.node("Mul", coordinates, per_length)
     each = graph.node("Unsqueeze", coordinates, graph.integers("centres_axis", [1]))
-    centres = graph.constant("centres", (raw - origin) * per_length)
+    centres = graph.constant("centres", scaled.centres)
     difference = graph.node("Sub", each, centres)
     squares = graph.node("Mul", difference, difference)
     axis = graph.integers("coordinates_axis", [2])
@@ -246,10 +224,3 @@ def _coordinates(graph: Graph, factor: Factor, state: str, name: str) -> str:
     return graph.node(
         "Reshape", image, graph.integers(f"{name}_flat", [0, len(down) * len(across)])
     )
-
-
-def _inwards(limit: FloatArray, centre: FloatArray, dtype: Number) -> NDArray[Any]:
-    """``limit`` rounded to ``dtype`` towards ``centre``, so that no action is beyond it."""
-    rounded = limit.astype(dtype)
-    beyond = np.abs(rounded.astype(np.float64) - centre) > np.abs(limit - centre)
-    return np.where(beyond, np.nextafter(rounded, centre.astype(dtype)), rounded)

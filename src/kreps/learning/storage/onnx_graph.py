@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from kreps.errors import ConfigurationError
-
-Number = type[np.floating[Any]]
+from kreps.learning.storage.exported import Number, rounded
 
 
 class Graph:
@@ -27,14 +25,7 @@ class Graph:
 
     def constant(self, name: str, values: Any, dtype: Number | None = None) -> str:
         """Add a tensor, of the dtype of the arithmetic unless another one is given."""
-        dtype = dtype or self.dtype
-        array = np.asarray(values, dtype=np.float64).astype(dtype)
-        if not np.isfinite(array).all():
-            raise ConfigurationError(
-                f"{name} of the policy go up to {np.abs(values).max():.3g}, the limit of "
-                f"{np.dtype(dtype).name} is {np.finfo(dtype).max:.3g}; "
-                "export it in float64, or learn in other units"
-            )
+        array = rounded(name, values, dtype or self.dtype)
         return self._tensor(name, array)
 
     def integers(self, name: str, values: Sequence[int]) -> str:

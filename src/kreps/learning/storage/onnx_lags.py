@@ -5,17 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from kreps.data.task import TaskSpec
-from kreps.learning.storage.onnx_graph import Graph, Number
-
-
-def has_lags(task: TaskSpec) -> bool:
-    """Whether states have more than the observation."""
-    return task.state_size > task.observation_size
-
-
-def lags_size(task: TaskSpec) -> int:
-    """Number of earlier observations and actions, h do + k da."""
-    return task.state_size - task.observation_size
+from kreps.learning.storage.exported import Number
+from kreps.learning.storage.onnx_graph import Graph
 
 
 def add_state(graph: Graph, task: TaskSpec) -> str:
