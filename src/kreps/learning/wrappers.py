@@ -20,6 +20,7 @@ KEEPS_STEPS = {
     "AddWhiteNoise",  # to pictures
     "Autoreset",
     "HumanRendering",
+    "Monitor",  # of Stable-Baselines3
     "NormalizeReward",
     "ObstructView",
     "OrderEnforcing",
@@ -29,7 +30,7 @@ KEEPS_STEPS = {
     "RenderCollection",
     "TimeLimit",
 }
-"""Wrappers of Gymnasium with a step of their own that change neither observations nor actions."""
+"""Known wrappers with a step of their own that change neither observations nor actions."""
 
 KEEPS_OBSERVATIONS = KEEPS_STEPS | {"RepeatAction", "StickyAction"}
 KEEPS_ORDER = {"FlattenObservation", "ReshapeObservation"}
@@ -49,7 +50,7 @@ def wrappers_of(env: Environment) -> Iterator[Wrapper]:
 
 def keeps_observations(wrapper: Wrapper) -> bool:
     """Whether a wrapper certainly leaves the coordinates of observations as they are."""
-    name = _gymnasium_name(wrapper)
+    name = _known_name(wrapper)
     if name in KEEPS_ORDER:
         return isinstance(wrapper.env.observation_space, gym.spaces.Box)
     return (
@@ -63,23 +64,25 @@ def keeps_actions(wrapper: Wrapper) -> bool:
     """Whether a wrapper certainly leaves the coordinates of actions and their units as they are."""
     return (
         isinstance(wrapper, RandomRestart | HeldActions)
-        or _gymnasium_name(wrapper) in KEEPS_ACTIONS
+        or _known_name(wrapper) in KEEPS_ACTIONS
         or _inherits(wrapper, gym.ObservationWrapper, gym.RewardWrapper)
     )
 
 
 def keeps_time(wrapper: Wrapper) -> bool:
     """Whether a step of a wrapper is certainly one step of what it wraps."""
-    if name := _gymnasium_name(wrapper):
+    if name := _known_name(wrapper):
         return name not in CHANGES_TIME
     bases = (gym.Wrapper, gym.ActionWrapper, gym.ObservationWrapper, gym.RewardWrapper)
     own = type(wrapper).step
     return isinstance(wrapper, RandomRestart | Perturbed) or any(own is base.step for base in bases)
 
 
-def _gymnasium_name(wrapper: Wrapper) -> str:
+def _known_name(wrapper: Wrapper) -> str:
+    """The name of a wrapper of Gymnasium, or of that of Stable-Baselines3; others have none."""
     kind = type(wrapper)
-    return kind.__name__ if kind.__module__.startswith("gymnasium.") else ""
+    known = ("gymnasium.", "stable_baselines3.common.monitor")
+    return kind.__name__ if kind.__module__.startswith(known) else ""
 
 
 def _inherits(wrapper: Wrapper, *bases: type[Wrapper]) -> bool:
@@ -138,7 +141,7 @@ def _take(
 def _declares(wrapper: Wrapper) -> bool:
     """Whether a wrapper has metadata of its own, and no copy of those of what it wraps."""
     own = "metadata" in vars(type(wrapper)) or vars(wrapper).get("_metadata") is not None
-    return own and not _gymnasium_name(wrapper)
+    return own and not _known_name(wrapper)
 
 
 def without_restarts(env: Environment) -> tuple[Environment, float | None]:

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 
 import kreps
-from kreps.app.cli.export import EXPORT_EXAMPLES, export
+from kreps.app.cli.export import CARD_EXAMPLES, EXPORT_EXAMPLES, card, export
 from kreps.app.cli.help import Command
 from kreps.app.cli.inspect import (
     DIAGNOSE_EXAMPLES,
@@ -73,6 +73,7 @@ _add(plot, PLOT_EXAMPLES)
 _add(diagnose, DIAGNOSE_EXAMPLES)
 _add(video, VIDEO_EXAMPLES)
 _add(export, EXPORT_EXAMPLES)
+_add(card, CARD_EXAMPLES)
 _add(reproduce, REPRODUCE_EXAMPLES)
 _add(search, SEARCH_EXAMPLES)
 

@@ -1,4 +1,4 @@
-"""The command that writes a policy for use elsewhere: export."""
+"""The commands that write a policy for use elsewhere: export and card."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from typing import Annotated
 import typer
 
 from kreps.app.cli.paths import PATH
+from kreps.app.cli.runs import RunArgument
 from kreps.app.console import say
+from kreps.app.model_card import CARD, write_model_card
 from kreps.app.run_folder import RunFolder
 from kreps.errors import ConfigurationError
 from kreps.learning.policy import Policy, load_policy, mean_difference
@@ -20,6 +22,8 @@ EXPORT_EXAMPLES = (
     "kreps export runs/swing-up --centres 50 --to c",
     "kreps export runs/swing-up/policy.safetensors --centres 50 --out small.safetensors",
 )
+
+CARD_EXAMPLES = ("kreps card runs/swing-up --out swing-up-policy",)
 
 FORMATS = ("onnx", "c", "safetensors")
 """What `export` writes, and the end of its file's name."""
@@ -77,6 +81,19 @@ def export(
     else:
         kind = _write_model(policy, out, to, dtype)
     say(f"wrote {out}: {kind}, {out.stat().st_size / 1e3:.0f} kB")
+
+
+def card(
+    run: RunArgument,
+    out: Annotated[Path, typer.Option(help="Folder to write.", **PATH)],
+) -> None:
+    """Write a folder for the Hugging Face Hub: policy, numbers and a model card.
+
+    Nothing is uploaded.  The card has the latest evaluation of the run, its command and how the
+    policy is loaded; read it before you publish it, as it has the environment's arguments.
+    """
+    write_model_card(RunFolder(run), out)
+    say(f"wrote {out / CARD}, beside the policy and its numbers")
 
 
 def _target(out: Path | None, to: str | None) -> tuple[Path, str]:
