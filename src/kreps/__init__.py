@@ -28,7 +28,9 @@ if TYPE_CHECKING:
     from kreps.data.rollouts import Rollout, Rollouts
     from kreps.data.task import TaskSpec
     from kreps.envs.restart import RandomRestart
+    from kreps.learning.callbacks import Checkpoint, EvalCallback, StopOnReward
     from kreps.learning.iteration import IterationReport
+    from kreps.learning.loggers import MLflow, TensorBoard, WandB
     from kreps.learning.methods import KREPS, NPALP, GridValueIteration, ValueIteration
     from kreps.learning.policy import Policy, load_policy
     from kreps.learning.storage import (
@@ -48,18 +50,21 @@ __all__ = [
     "PRESETS",
     "RKHS",
     "Columns",
+    "Checkpoint",
     "Compute",
     "ConfigurationError",
     "DataError",
     "DataWarning",
     "Dataset",
     "EnvironmentFailure",
+    "EvalCallback",
     "Exploration",
     "Grid",
     "GridValueIteration",
     "IterationReport",
     "KrepsError",
     "LowRank",
+    "MLflow",
     "ModelBased",
     "NumericalError",
     "Policy",
@@ -68,9 +73,12 @@ __all__ = [
     "Rollouts",
     "Settings",
     "SpaceError",
+    "StopOnReward",
     "StorageError",
     "TaskSpec",
+    "TensorBoard",
     "ValueIteration",
+    "WandB",
     "check_file",
     "load_policy",
     "load_rollouts",
@@ -89,6 +97,12 @@ _HOMES = {
     "GridValueIteration": "learning.methods",
     "NPALP": "learning.methods",
     "IterationReport": "learning.iteration",
+    "Checkpoint": "learning.callbacks",
+    "EvalCallback": "learning.callbacks",
+    "StopOnReward": "learning.callbacks",
+    "MLflow": "learning.loggers",
+    "TensorBoard": "learning.loggers",
+    "WandB": "learning.loggers",
     "Policy": "learning.policy",
     "load_policy": "learning.policy",
     "check_file": "learning.storage",

@@ -36,7 +36,12 @@ from kreps.seeding import Purpose, generator
 from kreps.settings import LearnerSettings
 
 
-def _whole_number(name: str, value: Any) -> int:
+def whole_number(name: str, value: Any) -> int:
+    """A whole number that a user gave.
+
+    Raises:
+        ConfigurationError: it is none, negative, or has more than 128 bits.
+    """
     if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= int(value) < 2**128:
         raise ConfigurationError(
             f"{name} = {shown(value)}, but it must be a whole number >= 0 of at most 128 bits"
@@ -88,7 +93,7 @@ class Learner(Generic[MethodSettings]):
         preset: str | MethodSettings = "default",
         **settings: Any,
     ) -> None:
-        self.seed = _whole_number("seed", seed)
+        self.seed = whole_number("seed", seed)
         self.env: Environment | None = None
         if isinstance(env, TaskSpec):
             if periodic is not None:
@@ -106,7 +111,7 @@ class Learner(Generic[MethodSettings]):
         self.task = self._completed(self.task, chooses=not isinstance(env, TaskSpec))
         if not isinstance(env, TaskSpec):
             self._act_in(env)
-        self.threads = None if threads is None else max(1, _whole_number("threads", threads))
+        self.threads = None if threads is None else max(1, whole_number("threads", threads))
         self.state = LearnerState(
             ReplayWindow(self.task, self.settings.window, self.settings.window_steps)
         )
@@ -193,7 +198,7 @@ class Learner(Generic[MethodSettings]):
                 "in; pass rollouts to update(), learn on a robot in a session(), or make the "
                 "learner from an environment"
             )
-        iterations = _whole_number("iterations", iterations)
+        iterations = whole_number("iterations", iterations)
         callbacks = callbacks_of(callback)
         if progress:
             from kreps.learning.progress import ProgressTable
