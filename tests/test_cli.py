@@ -26,6 +26,7 @@ from kreps.data.task import TaskSpec
 from kreps.kernels.kernel import Kernel, factors_of
 from kreps.learning.evaluate import Greedy, evaluate
 from kreps.policies.sparse_gp import SparseGP
+from kreps.presets import SECTIONS, flat
 
 NAME = "kreps/SwingUp-v0"
 SETTINGS = {
@@ -160,6 +161,106 @@ def test_the_examples_of_train_are_valid(tmp_path: Path, monkeypatch: pytest.Mon
         example[place + 1] = f"run-{number}"
         changed = [*example, "--iterations", "1", "--no-report", *TINY]
         assert call("train", *changed)[0] == 0
+
+
+# ---- flags of settings ------------------------------------------------------------------------
+
+
+def test_train_has_a_flag_for_each_setting() -> None:
+    text = call("train", "--help")[1]
+    settings = flat(kreps.Settings()) | flat(kreps.Settings(value=kreps.Grid()))
+    assert len(settings) > 30
+    for name, default in settings.items():
+        shown = "none" if default is None else default
+        assert f"--{name.replace('_', '-')} " in text
+        if name not in SECTIONS:
+            assert f"(default: {shown})" in text
+    assert "FLOAT|none" in text and "dynamics|change|embedding|sample" in text
+
+
+def test_a_flag_is_the_setting_of_its_name(tmp_path: Path) -> None:
+    def stored(*options: str) -> Any:
+        run = tmp_path / str(len([*tmp_path.iterdir()]))
+        assert train(run, *options, iterations=1)[0] == 0
+        return json.loads((run / "config.json").read_text())["settings"]
+
+    flags = ["--kl-bound", "0.5", "--value", "grid", "--value.size=5", "--low-rank", "none"]
+    names = ["kl_bound=0.5", "value=grid", "value.size=5", "low_rank=none"]
+    by_name = stored(*(part for name in names for part in ("--set", name)))
+    assert stored(*flags) == by_name
+    assert by_name["low_rank"] is None and by_name["value.size"] == 5
+    # of an option that is given several times the last one counts, and flags come last
+    assert stored("--kl-bound", "0.5", "--set", "kl_bound=0.25")["kl_bound"] == 0.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--kl-bound", "wide"], "kl_bound = 'wide'"),
+        (["--kl-bound", "-1"], "kl_bound = -1"),
+        (["--window", "2.5"], "window = 2.5"),
+        (["--value.size", "5"], "value.size"),
+        (["--model-based", "none", "--model-based.max-samples", "9"], "leaves that section out"),
+        (["--kl-bond", "1"], "--kl-bond"),
+    ],
+)
+def test_mistakes_of_flags_are_those_of_the_settings(
+    arguments: list[str], says: str, tmp_path: Path
+) -> None:
+    assert says in rejected("train", NAME, *arguments, "--out", tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize(
+    ("line", "wanted"),
+    [
+        ("kreps exp", {"export"}),
+        ("kreps train Pend", {"Pendulum-v1"}),
+        ("kreps train --kl-b", {"--kl-bound"}),
+        ("kreps train --policy-fit ", {"map", "bounded"}),
+        ("kreps train --low-rank n", {"none"}),
+        ("kreps train --preset p", {"paper"}),
+    ],
+)
+def test_a_shell_completes(line: str, wanted: set[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("_KREPS_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", line)
+    monkeypatch.setenv("COMP_CWORD", str(len(line.split(" ")) - 1))
+    assert set(call()[1].split()) == wanted
+
+
+# ---- envs -------------------------------------------------------------------------------------
+
+
+def test_envs_lists_what_can_be_learnt(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code, text = call("envs")
+    assert code == 0
+    entry = "gymnasium.envs.classic_control.pendulum:PendulumEnv"
+    assert (
+        f"Pendulum-v1 3 observations, 1 actions, a step of 0.05 s, episodes of 200 steps; {entry}"
+        in text
+    )
+    assert f"{NAME} 2 observations" in text and "kreps-tests/Short-v0 3 observations" in text
+    assert "CartPole" not in text and "gymnasium.register(" in text
+    assert "CartPole-v1: the action space is Discrete(2)" in call("envs", "--all")[1]
+
+    module = tmp_path / "robot_of_a_test.py"
+    module.write_text(
+        "import gymnasium\n"
+        "from gymnasium.envs.classic_control import PendulumEnv\n"
+        "class Mine(PendulumEnv): pass\n"
+        "gymnasium.register('mine/Pendulum-v0', entry_point=Mine)\n"
+        "gymnasium.register('mine/Broken-v0', entry_point='robot_of_a_test:Missing')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    for _ in range(2):  # also where the module is imported already
+        code, text = call("envs", "robot_of_a_test", "--all")
+        assert "mine/Pendulum-v0 3 observations" in text and "robot_of_a_test:Mine" in text
+        assert "mine/Broken-v0: cannot make the environment" in text
+        assert "kreps/SwingUp" not in text
+    for name in ("mine/Pendulum-v0", "mine/Broken-v0"):
+        del gym.registry[name]
+    assert "cannot import the module 'no_such_module'" in rejected("envs", "no_such_module")
 
 
 # ---- train ------------------------------------------------------------------------------------
@@ -329,16 +430,6 @@ def test_settings_reach_the_learner(
     assert {name: getattr(settings, name) for name in expected} == expected
     stored = json.loads((tmp_path / "config.json").read_text())["settings"]
     assert set(stored) == {option.split("=")[0] for option in options} | set(SETTINGS)
-
-
-def test_the_help_of_train_names_every_setting() -> None:
-    text = call("train", "--help")[1]
-    flat = kreps.presets.flat(kreps.Settings()) | kreps.presets.flat(
-        kreps.Settings(value=kreps.Grid())
-    )
-    fields = [name for name in flat if name not in ("value", "exploration")]
-    assert len(fields) > 20
-    assert [name for name in fields if name not in text] == []
 
 
 @pytest.mark.parametrize("preset", list(kreps.PRESETS))

@@ -15,7 +15,9 @@ from typing import Annotated, Any
 import typer
 
 import kreps
+from kreps.app.cli.envs import ENVS_EXAMPLES, envs
 from kreps.app.cli.export import CARD_EXAMPLES, EXPORT_EXAMPLES, card, export
+from kreps.app.cli.flags import with_settings
 from kreps.app.cli.help import Command
 from kreps.app.cli.inspect import (
     DIAGNOSE_EXAMPLES,
@@ -29,7 +31,7 @@ from kreps.app.cli.inspect import (
 )
 from kreps.app.cli.recorded import IMPORT_EXAMPLES, import_
 from kreps.app.cli.reproduce import REPRODUCE_EXAMPLES, SEARCH_EXAMPLES, reproduce, search
-from kreps.app.cli.settings import SETTINGS_EXAMPLES, settings, settings_help
+from kreps.app.cli.settings import SETTINGS_EXAMPLES, settings
 from kreps.app.cli.train import RESUME_EXAMPLES, TRAIN_EXAMPLES, resume, train
 from kreps.app.console import guarded, say, say_error
 from kreps.errors import KrepsError
@@ -37,7 +39,6 @@ from kreps.terminal import printable
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="rich",
     help="Kernel-based, non-parametric policy search: REPS with RKHS embeddings.\n\n"
     "[bold]Start here:[/bold]  kreps train kreps/SwingUp-v0 --out runs/swing-up",
@@ -53,21 +54,17 @@ def options(
         raise typer.Exit
 
 
-def _add(
-    command: Callable[..., Any],
-    examples: Sequence[str],
-    more_help: str = "",
-    name: str | None = None,
-) -> None:
+def _add(command: Callable[..., Any], examples: Sequence[str], name: str | None = None) -> None:
     lines = "\n\n".join(f"  {example}" for example in examples)
-    text = f"{getdoc(command)}\n\n{more_help}"
-    app.command(name, cls=Command, help=text, epilog=f"Examples:\n\n{lines}")(command)
+    help_ = getdoc(command)
+    app.command(name, cls=Command, help=help_, epilog=f"Examples:\n\n{lines}")(command)
 
 
-_add(train, TRAIN_EXAMPLES, settings_help())
+_add(with_settings(train), TRAIN_EXAMPLES)
 _add(resume, RESUME_EXAMPLES)
 _add(import_, IMPORT_EXAMPLES, name="import")
 _add(settings, SETTINGS_EXAMPLES)
+_add(envs, ENVS_EXAMPLES)
 _add(evaluate, EVALUATE_EXAMPLES)
 _add(plot, PLOT_EXAMPLES)
 _add(diagnose, DIAGNOSE_EXAMPLES)
@@ -102,7 +99,8 @@ def main() -> None:
 def _run() -> int:
     """Run a command and return its exit status."""
     try:
-        return app(standalone_mode=False) or 0  # a command's typer.Exit is returned as its code
+        # a command's typer.Exit is returned as its code
+        return app(prog_name="kreps", standalone_mode=False) or 0
     except KrepsError as error:
         say_error(str(error))
     except Exception as error:

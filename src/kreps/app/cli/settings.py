@@ -6,15 +6,15 @@ import inspect
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from typing import Annotated, Any
 
 import typer
 
 from kreps.app.console import say
 from kreps.errors import ConfigurationError
-from kreps.presets import PRESETS, SECTIONS, flat, settings_of
-from kreps.settings import LearnerSettings, Settings
+from kreps.presets import PRESETS, flat, settings_of
+from kreps.settings import LearnerSettings
 
 SETTINGS_EXAMPLES = ("kreps settings", "kreps settings --preset paper")
 
@@ -42,30 +42,6 @@ def parse_setting(text: str, option: str = "--set") -> tuple[str, Any]:
         return name, value
 
 
-def settings_help() -> str:
-    """The names of all settings by section, for ``kreps train --help``."""
-    plain = [each.name for each in fields(Settings) if each.name not in SECTIONS]
-    lines = [f"  {', '.join(plain)}"]
-    for section, kinds in SECTIONS.items():
-        types = {type(default): kind for kind, default in kinds.items()}
-        for section_type, kind in types.items():
-            names = ", ".join(f"{section}.{each.name}" for each in fields(section_type))
-            lines.append(f"  {names}" + (f" (with {section}={kind})" if len(types) > 1 else ""))
-    absent = " and ".join(f"{name}=none" for name in optional_sections())
-    return "\n\n".join(
-        [
-            "[bold]Settings[/bold] for --set NAME=VALUE, explained by [bold]kreps settings[/bold]:",
-            *lines,
-            f"{absent} leave a section out.",
-        ]
-    )
-
-
-def optional_sections() -> list[str]:
-    """Sections that may be None."""
-    return [each.name for each in fields(Settings) if each.name in SECTIONS and "None" in each.type]
-
-
 def descriptions(settings_type: type[Any]) -> dict[str, str]:
     """The text about each field, from the docstrings of a class and of its bases."""
     found: dict[str, str] = {}
@@ -89,7 +65,7 @@ def settings(
     """List all settings with their values in a preset and their meaning."""
     chosen = settings_of(preset)
     values = flat(chosen)
-    say(f"Settings of the preset {preset}, for --set NAME=VALUE\n")
+    say(f"Settings of the preset {preset}, for --set NAME=VALUE or flags such as --kl-bound 0.5\n")
     for name, text in _all_descriptions(chosen):
         value = values.get(name, "")
         say(name if value == "" else f"{name} = {'none' if value is None else value}")

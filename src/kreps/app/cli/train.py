@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from kreps.app.cli.envs import names_of_environments
 from kreps.app.cli.paths import PATH
 from kreps.app.cli.recorded import ColumnOption, SpecOption, TaskOption, given_spec, recorded
 from kreps.app.cli.runs import RunArgument
@@ -29,10 +30,10 @@ from kreps.recordings.spec import Spec
 TRAIN_EXAMPLES = (
     "kreps train kreps/SwingUp-v0 --iterations 20 --seed 0 --out runs/swing-up",
     "kreps train kreps/SwingUp-v0 --preset paper --out runs/paper-like",
-    "kreps train kreps/SwingUp-v0 --set value=grid --set value.size=5 --out runs/grid",
+    "kreps train kreps/SwingUp-v0 --value grid --value.size 5 --out runs/grid",
     "kreps train kreps/SwingUp-v0 --set model_based=none --out runs/one-step",
     "kreps train kreps/ImageSwingUp-v0 --iterations 15 --out runs/images",
-    "kreps train Pendulum-v1 --set kl_bound=0.5 --set window=60 --out runs/pendulum",
+    "kreps train Pendulum-v1 --kl-bound 0.5 --window 60 --out runs/pendulum",
     "kreps train my_robot.envs:Arm-v0 --periodic 0 --periodic 1 --out runs/arm",
     "kreps train my_robot.envs:Arm-v0 --env-arg port=/dev/ttyUSB0 --out runs/arm",
     "kreps train --data recording.parquet --spec robot.toml --out runs/first",
@@ -54,7 +55,8 @@ def train(
         str | None,
         typer.Argument(
             help="Gymnasium name, or module:name to import the module first, which may lie in the "
-            "current folder.  With --data there is none."
+            "current folder.  With --data there is none.",
+            autocompletion=names_of_environments,
         ),
     ] = None,
     iterations: Annotated[
@@ -68,13 +70,18 @@ def train(
         str,
         typer.Option(
             help="model_based; single_step: one step on the sampled actions; paper: close to the "
-            "printed method; authors: as in the authors' scripts."
+            "printed method; authors: as in the authors' scripts.",
+            autocompletion=lambda: list(PRESETS),
         ),
     ] = next(iter(PRESETS)),
     recipe: Annotated[str | None, typer.Option(hidden=True)] = None,
     set_: Annotated[
         list[str],
-        typer.Option("--set", metavar="NAME=VALUE", help="Change one setting; may be repeated."),
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Change one setting, as the flag of its name does; may be repeated.",
+        ),
     ] = [],  # noqa: B006 (typer reads the default)
     env_arg: Annotated[
         list[str],
@@ -99,6 +106,8 @@ def train(
     report: ReportOption = True,
 ) -> None:
     """Learn a policy, show the progress, and leave a run folder with the policy and pictures.
+
+    Settings have flags, and are explained in full by [bold]kreps settings[/bold].
 
     Ctrl-C stops at any time: all finished updates are stored, and [bold]kreps resume[/bold]
     continues.
