@@ -27,6 +27,7 @@ class Purpose(IntEnum):
     BOOTSTRAP = 7
     PREDICTION = 8
     EXTRAPOLATION = 9
+    TUNING = 10
 
 
 def _sequence(seed: int, purpose: Purpose, indices: tuple[int, ...]) -> np.random.SeedSequence:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import shlex
 from pathlib import Path
-from typing import Any
 
-from kreps.app.run_folder import RunConfig, RunFolder
+from kreps.app.run_folder import RunFolder
 from kreps.errors import ConfigurationError, StorageError
 from kreps.learning.storage import write_atomically
 
@@ -93,7 +91,7 @@ only; no code is run to read it.
 ## How it was learnt
 
 ```
-{_command(config)}
+{config.command("run")}
 ```
 
 `progress.csv` has the numbers of each update, `config.json` the configuration and the versions of
@@ -129,25 +127,6 @@ def _table(measured: dict[str, tuple[str, float, float]]) -> str:
     return "\n".join(
         f"| {name} | {mean:.5g} | {2.0 * error:.2g} |" for name, mean, error in measured.values()
     )
-
-
-def _command(config: RunConfig) -> str:
-    """The command that makes the run again."""
-    options = [
-        *(("--set", f"{name}={_value(value)}") for name, value in config.settings.items()),
-        *(("--env-arg", f"{name}={_value(value)}") for name, value in config.arguments.items()),
-        *(("--periodic", str(i)) for i in config.periodic or ()),
-        ("--preset", config.preset),
-        ("--iterations", str(config.iterations)),
-        ("--seed", str(config.seed)),
-        ("--out", "run"),
-    ]
-    words = ["kreps", "train", config.environment, *(word for pair in options for word in pair)]
-    return shlex.join(words)
-
-
-def _value(value: Any) -> str:
-    return "none" if value is None else value if isinstance(value, str) else json.dumps(value)
 
 
 def _quoted(text: str) -> str:

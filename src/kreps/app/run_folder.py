@@ -9,6 +9,7 @@ are ahead of it are dropped on resuming.
 from __future__ import annotations
 
 import json
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, fields
@@ -51,6 +52,20 @@ class RunConfig:
     periodic: list[int] | None
     arguments: dict[str, Any] = field(default_factory=dict)
     data: list[str] = field(default_factory=list)
+
+    def command(self, out: str) -> str:
+        """The command that makes the run in the folder ``out``."""
+        options = [
+            *(("--set", f"{name}={_word(value)}") for name, value in self.settings.items()),
+            *(("--env-arg", f"{name}={_word(value)}") for name, value in self.arguments.items()),
+            *(("--periodic", str(i)) for i in self.periodic or ()),
+            ("--preset", self.preset),
+            ("--iterations", str(self.iterations)),
+            ("--seed", str(self.seed)),
+            ("--out", out),
+        ]
+        words = ["kreps", "train", self.environment, *(word for pair in options for word in pair)]
+        return shlex.join(words)
 
 
 class RunFolder:
@@ -222,6 +237,11 @@ class RunFolder:
         assert learner.state.policy is not None
         save_policy(learner.state.policy, self.policy_file)
         learner.save(self.checkpoint_file)
+
+
+def _word(value: Any) -> str:
+    """A value as the command line reads it."""
+    return "none" if value is None else value if isinstance(value, str) else json.dumps(value)
 
 
 def _evaluated(content: Any) -> dict[str, Any]:

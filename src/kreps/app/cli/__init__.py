@@ -33,6 +33,7 @@ from kreps.app.cli.recorded import IMPORT_EXAMPLES, import_
 from kreps.app.cli.reproduce import REPRODUCE_EXAMPLES, SEARCH_EXAMPLES, reproduce, search
 from kreps.app.cli.settings import SETTINGS_EXAMPLES, settings
 from kreps.app.cli.train import RESUME_EXAMPLES, TRAIN_EXAMPLES, resume, train
+from kreps.app.cli.tune import TUNE_EXAMPLES, tune
 from kreps.app.console import guarded, say, say_error
 from kreps.errors import KrepsError
 from kreps.terminal import printable
@@ -63,6 +64,7 @@ def _add(command: Callable[..., Any], examples: Sequence[str], name: str | None 
 _add(with_settings(train), TRAIN_EXAMPLES)
 _add(resume, RESUME_EXAMPLES)
 _add(import_, IMPORT_EXAMPLES, name="import")
+_add(with_settings(tune), TUNE_EXAMPLES)
 _add(settings, SETTINGS_EXAMPLES)
 _add(envs, ENVS_EXAMPLES)
 _add(evaluate, EVALUATE_EXAMPLES)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import inspect
 import re
-from collections.abc import Callable, Iterator
-from dataclasses import fields
-from functools import wraps
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import cache, wraps
 from types import NoneType
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
@@ -29,7 +29,7 @@ def with_settings(command: Command) -> Command:
     ``--kl-bound 0.5`` is ``--set kl_bound=0.5``: it is appended to the command's argument ``set_``,
     so names and values are checked in one place.
     """
-    names = dict(_flags())
+    names = all_settings()
 
     @wraps(command)
     def run(**given: Any) -> Any:
@@ -43,9 +43,12 @@ def with_settings(command: Command) -> Command:
     signature = inspect.signature(command, eval_str=True)
     added = [
         inspect.Parameter(
-            _identifier(name), inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
+            _identifier(name),
+            inspect.Parameter.KEYWORD_ONLY,
+            default=None,
+            annotation=_option(name, setting),
         )
-        for name, annotation in names.items()
+        for name, setting in names.items()
     ]
     run.__signature__ = signature.replace(  # type: ignore[attr-defined]
         parameters=[*signature.parameters.values(), *added]
@@ -57,23 +60,44 @@ def _identifier(name: str) -> str:
     return f"setting_{name.replace('.', '_')}"
 
 
-def _flags() -> Iterator[tuple[str, Any]]:
-    """Names of all settings, and the annotations by which Typer makes an option of each."""
+@dataclass(frozen=True)
+class Setting:
+    """A setting as a flag shows it.
+
+    Attributes:
+        panel: heading of its group.
+        text: its description.
+        choices: words, and names of types in capitals.
+        default: of the preset model_based, or of its section.
+    """
+
+    panel: str
+    text: str
+    choices: list[str]
+    default: Any
+
+
+@cache
+def all_settings() -> dict[str, Setting]:
+    """All settings by their dotted names."""
+    found: dict[str, Setting] = {}
     hints, texts, defaults = get_type_hints(Settings), descriptions(Settings), flat(Settings())
     for field in fields(Settings):
         name, hint = field.name, hints[field.name]
         kinds = list(SECTIONS.get(name, ()))
         choices = kinds + ["none"] * (NoneType in get_args(hint)) if kinds else _choices(hint)
         default = kinds[0] if kinds else defaults[name]
-        yield name, _option(name, PANEL, texts[name], choices, default)
+        found[name] = Setting(PANEL, texts[name], choices, default)
     for section, kinds_of in SECTIONS.items():
         types = {type(default): kind for kind, default in kinds_of.items()}
         for section_type, kind in types.items():
             hints, texts = get_type_hints(section_type), descriptions(section_type)
             panel = f"Settings of {section}" + (f"={kind}" if len(types) > 1 else "")
             for field in fields(section_type):
-                name, choices = f"{section}.{field.name}", _choices(hints[field.name])
-                yield name, _option(name, panel, texts[field.name], choices, field.default)
+                choices = _choices(hints[field.name])
+                setting = Setting(panel, texts[field.name], choices, field.default)
+                found[f"{section}.{field.name}"] = setting
+    return found
 
 
 def _choices(hint: Any) -> list[str]:
@@ -85,19 +109,19 @@ def _choices(hint: Any) -> list[str]:
     return [word for part in get_args(hint) for word in _choices(part)]
 
 
-def _option(name: str, panel: str, text: str, choices: list[str], default: Any) -> Any:
+def _option(name: str, setting: Setting) -> Any:
     """The annotation of a flag, with the first sentence about the setting as its help."""
-    sentence = re.split(r"(?<=\.)\s(?=[A-Z])", text)[0]
+    sentence = re.split(r"(?<=\.)\s(?=[A-Z])", setting.text)[0]
     if sentence[1].isalpha():
         sentence = sentence[0].upper() + sentence[1:]
-    shown = "none" if default is None else default
+    default = "none" if setting.default is None else setting.default
     option = typer.Option(
         f"--{name.replace('_', '-')}",
-        help=f"{sentence} (default: {shown})",
-        metavar="|".join(choices),
+        help=f"{sentence} (default: {default})",
+        metavar="|".join(setting.choices),
         show_default=False,
-        rich_help_panel=panel,
-        autocompletion=_completion([each for each in choices if each not in TYPES.values()]),
+        rich_help_panel=setting.panel,
+        autocompletion=_completion([w for w in setting.choices if w not in TYPES.values()]),
     )
     return Annotated[str | None, option]
 
