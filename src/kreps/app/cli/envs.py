@@ -43,7 +43,8 @@ class Registered(NamedTuple):
         observations, actions = self.sizes
         step = "" if self.dt is None else f", a step of {self.dt:.3g} s"
         episode = "" if self.time_limit is None else f", episodes of {self.time_limit} steps"
-        return f"{observations} observations, {actions} actions{step}{episode}; {self.entry}"
+        sizes = f"{observations} observation and {actions} action coordinates"
+        return f"{sizes}{step}{episode}; {self.entry}"
 
 
 def envs(
