@@ -12,6 +12,9 @@ from kreps.app.console import console, say
 TABLE_WIDTH = 72
 """Columns of a terminal that the tables of options need; narrower ones cut the names."""
 
+LONG_NAME, LONG_TABLE_WIDTH = 24, 110
+"""Letters of a name above which a table needs more columns, and how many: flags of settings."""
+
 INDENT = 4
 
 
@@ -19,11 +22,13 @@ class Command(TyperCommand):
     """A command whose help is a list where the terminal is too narrow for tables."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        if console().width >= TABLE_WIDTH:
+        parameters = self.get_params(ctx)
+        longest = max(len(name) for parameter in parameters for name in parameter.opts)
+        if console().width >= (LONG_TABLE_WIDTH if longest > LONG_NAME else TABLE_WIDTH):
             super().format_help(ctx, formatter)
             return
         say(f"{self.get_usage(ctx)}\n\n{_plain(self.help)}\n")
-        for parameter in self.get_params(ctx):
+        for parameter in parameters:
             record = parameter.get_help_record(ctx)
             if record is not None:
                 names, text = record
