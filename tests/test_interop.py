@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import shlex
+import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import pytest
 
 import kreps
 from kreps.app import cli
+from kreps.app.run_folder import RunFolder
 from kreps.errors import ConfigurationError, DataError
 from kreps.experiments.scores import score_arrays
 
@@ -202,6 +205,11 @@ def test_a_model_card_is_one_of_the_hub_and_its_command_learns_the_policy(
     assert call(*shlex.split(train)[1:]) == 0
     assert call("card", "first", "--out", "card") == 2
     assert "kreps evaluate first" in capsys.readouterr().err
+    config = RunFolder("first").config()
+    RunFolder("recorded").create(replace(config, environment="", data=["x.csv"]))
+    shutil.copy("first/progress.csv", "recorded")
+    assert call("card", "recorded", "--out", "card") == 2
+    assert "a run from recorded data" in capsys.readouterr().err
     assert call("evaluate", "first", "--episodes", "2", "--steps", "200") == 0
     assert call("card", "first", "--out", "card") == 0
     names = {path.name for path in (tmp_path / "card").iterdir()}

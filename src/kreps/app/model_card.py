@@ -27,7 +27,8 @@ def write_model_card(folder: RunFolder, out: Path) -> None:
         out: folder that is made unless it is there.
 
     Raises:
-        ConfigurationError: the run has no update yet, or its policy was not evaluated.
+        ConfigurationError: the run has no update yet, its policy was not evaluated, or it is from
+            recorded data.
         StorageError: a file of the run is damaged, or one cannot be written.
     """
     text = model_card(folder)
@@ -46,6 +47,11 @@ def write_model_card(folder: RunFolder, out: Path) -> None:
 def model_card(folder: RunFolder) -> str:
     """The model card: metadata as YAML, and what they mean in words."""
     config, last = folder.config(), folder.recorded_rows()[-1]
+    if config.data:
+        raise ConfigurationError(
+            f"{folder.path} is a run from recorded data, whose policy was not evaluated in an "
+            "environment, as a card needs; copy its policy.safetensors instead"
+        )
     measured = _measured(folder, int(last["iteration"]))
     picture = f"\n![Average reward per step over environment steps]({CURVE})\n"
     return f"""---
