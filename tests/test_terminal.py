@@ -149,7 +149,7 @@ def test_help_shows_every_option_in_full_at_any_width(columns: int) -> None:
             "--no-report",
             "--env-arg",
             "NAME=VALUE",
-            "[default: 20",
+            "[default: 0",
             LONGEST,
         ),
         "export": ("--centres", "RUN_OR_POLICY"),
