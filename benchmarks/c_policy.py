@@ -1,4 +1,4 @@
-"""Time and accuracy of a policy as C source: the table of docs/export.md.
+"""Time and accuracy of a policy as C source: the table of docs/how_to/export.md.
 
     python benchmarks/c_policy.py
 

@@ -240,9 +240,9 @@ class Policy:
 
         Beside ``NAME.c`` is its header, ``NAME.h``.  The function ``NAME_act`` gives the mean
         action (da,), clipped to the task's limits, from the observation (do,), both in the task's
-        units (docs/export.md).  A policy that needs earlier steps also has ``lags``, an array of
-        h do + k da numbers, which ``NAME_start`` sets at the start of an episode and ``NAME_act``
-        updates: once per decision, not per control period (docs/delays.md).
+        units (docs/how_to/export.md).  A policy that needs earlier steps also has ``lags``, an
+        array of h do + k da numbers, which ``NAME_start`` sets at the start of an episode and
+        ``NAME_act`` updates: once per decision, not per control period (docs/delays.md).
 
         Args:
             path: such as ``arm_policy.c``; the folder must exist.
