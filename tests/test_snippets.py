@@ -10,10 +10,12 @@ import ast
 import re
 import shlex
 import sys
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from pathlib import Path
+from threading import current_thread, main_thread
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
@@ -82,7 +84,7 @@ class Arm:
 
 
 class Clock:
-    """Time that passes by sleeping only."""
+    """Time that passes by the sleep of the program only, not by that of a watchdog's thread."""
 
     now = 0.0
 
@@ -90,7 +92,10 @@ class Clock:
         return self.now
 
     def sleep(self, seconds: float) -> None:
-        self.now += seconds
+        if current_thread() is main_thread():
+            self.now += seconds
+        else:
+            time.sleep(0.01)
 
 
 class Turns:
