@@ -83,7 +83,7 @@ def call(*arguments: str | Path) -> tuple[int, str]:
         contextlib.redirect_stderr(printed),
     ):
         patch.setattr(sys, "argv", ["kreps", *map(str, arguments)])
-        patch.setenv("COLUMNS", "400")
+        patch.setenv("COLUMNS", "600")
         try:
             cli.main()
         except SystemExit as stop:
