@@ -217,7 +217,7 @@ def test_mistakes_of_flags_are_those_of_the_settings(
         ("kreps exp", {"export"}),
         ("kreps train Pend", {"Pendulum-v1"}),
         ("kreps train --kl-b", {"--kl-bound"}),
-        ("kreps train --policy-fit ", {"map", "bounded"}),
+        ("kreps train --policy-fit ", {"map", "bounded", "free"}),
         ("kreps train --low-rank n", {"none"}),
         ("kreps train --preset p", {"paper"}),
     ],
