@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -73,18 +76,37 @@ def test_predictions_are_those_of_the_part_of_each_column() -> None:
 
 def test_equal_targets_share_one_kernel() -> None:
     target = np.sin(samples().states[:, 0])
-    regression, errors, inputs = fitted(np.stack([target, -target], axis=1))
-    assert regression.columns == ([0, 1],)
+    regression, errors, inputs = fitted(np.stack([target, -target, target], axis=1))
+    assert regression.columns == ([0, 1, 2],)
     found = regression(inputs)
     np.testing.assert_allclose(found[:, 0], -found[:, 1], atol=1e-12)
-    assert errors.shape == (len(target), 2)
+    assert errors.shape == (len(target), 3)
 
 
-@pytest.mark.parametrize("width", [1, 2])
-def test_targets_that_are_zero_are_predicted_as_zero(width: int) -> None:
-    regression, errors, inputs = fitted(np.zeros((len(samples()), width)))
-    np.testing.assert_array_equal(regression(inputs), np.zeros((len(inputs), width)))
-    np.testing.assert_array_equal(errors, np.zeros((len(inputs), width)))
+def test_targets_that_are_zero_are_predicted_as_zero() -> None:
+    regression, errors, inputs = fitted(np.zeros((len(samples()), 3)))
+    np.testing.assert_array_equal(regression(inputs), np.zeros((len(inputs), 3)))
+    np.testing.assert_array_equal(errors, np.zeros((len(inputs), 3)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "columns"),
+    [
+        ({"groups": ((0, 1),)}, [[0, 1], [2]]),
+        ({"groups": ((0, 1, 2),)}, [[0, 1, 2]]),
+        ({"groups": ((0, 1, 2),), "image_shape": (1, 3)}, [[0, 1, 2]]),
+        ({"groups": ((0,), (1,), (2,)), "image_shape": (1, 1)}, [[0, 1, 2]]),
+    ],
+)
+def test_columns_that_share_a_lengthscale_share_a_kernel(
+    changes: dict[str, Any], columns: list[list[int]]
+) -> None:
+    """Images have one kernel for all pixels, however many they are."""
+    task, data = replace(TASK, **changes), samples()
+    rng = np.random.default_rng(1)
+    kernel = state_kernel(data, task, rng)
+    regression, *_ = fit_coordinates(data, smooth_and_noise(data), kernel, task, None, rng)
+    assert sorted(regression.columns) == columns
 
 
 def test_derivatives_are_those_of_the_predictions() -> None:

@@ -81,7 +81,7 @@ def fit_coordinates(
 
     Args:
         data: n transitions.
-        targets: (n, k).
+        targets: (n, k), one for each coordinate of the observation.
         state_kernel: over states, at median lengthscales.
         task: limits and scale of the actions.
         start: log hyper-parameters (g + da + 1,) of the shared kernel in the last fit, if there was
@@ -95,22 +95,37 @@ def fit_coordinates(
     inputs = state_actions(data, task)
     shared, x = fit_regression(data, targets, state_kernel, task, start, rng)
     errors = shared.leave_one_out(targets).errors
-    own: dict[int, KernelExpansion] = {}
+    columns: list[list[int]] = []
+    parts: list[KernelExpansion] = []
     of_own = rng.spawn(1)[0]  # so that all else of an update has the same random numbers as before
     jitter = shared.factor.jitter
-    for j in np.flatnonzero(targets.any(axis=0)) if targets.shape[1] > 1 else ():
-        target = targets[:, [j]]
+    for group in _groups(targets, task):
+        target = targets[:, group]
         kernel, regulariser, _ = embedding_hyperparameters(
             inputs, target, state_kernel, task, None, of_own, (x,), LOG_LENGTHSCALE_STD
         )
         model = PivotedEmbedding.fit(kernel, inputs, regulariser)
         single = model or KernelEmbedding.fit(kernel, inputs, regulariser)
-        new = single.leave_one_out(target).errors[:, 0]
-        if new @ new < MAX_ERROR_RATIO * (errors[:, j] @ errors[:, j]):
-            errors[:, j] = new
-            own[int(j)], jitter = single.predictor(target), max(jitter, single.factor.jitter)
+        new = single.leave_one_out(target).errors
+        if np.sum(new**2) < MAX_ERROR_RATIO * np.sum(errors[:, group] ** 2):
+            errors[:, group] = new
+            columns.append(group)
+            parts.append(single.predictor(target))
+            jitter = max(jitter, single.factor.jitter)
+    own = {j for group in columns for j in group}
     rest = [j for j in range(targets.shape[1]) if j not in own]
-    columns, parts = [[j] for j in own], list(own.values())
     if rest:
         columns, parts = [*columns, rest], [*parts, shared.predictor(targets[:, rest])]
     return CoordinateRegressions(tuple(columns), tuple(parts), targets.shape[1]), errors, x, jitter
+
+
+def _groups(targets: FloatArray, task: TaskSpec) -> list[list[int]]:
+    """The columns that may have a kernel of their own: those that share a lengthscale together.
+
+    None in images, whose pixels are no coordinates, nor where there is only one; nor targets of
+    zero.
+    """
+    groups = [list(factor.dims) for factor in task.observation_factors]
+    if task.image_shape is not None or len(groups) < 2:
+        return []
+    return [group for group in groups if targets[:, group].any()]
