@@ -6,8 +6,8 @@ they improve the policy that the bounded steps have found.
 
 A step moves the mean of the policy in the direction in which the return grows fastest per mean
 squared change of the actions in visited states.  That is the natural gradient: with a constant
-variance the KL divergence between two policies is this change.  Its size is doubled or so after a
-gain, and reduced without one.
+variance the KL divergence between two policies is this change.  Its size grows after a gain and
+shrinks without one.
 """
 
 from __future__ import annotations

@@ -165,6 +165,14 @@ class PivotedEmbedding:
         return LeaveOneOut(targets[rows], errors[rows])
 
 
+def embedding_of(
+    kernel: Kernel, inputs: FloatArray, regulariser: float
+) -> PivotedEmbedding | KernelEmbedding:
+    """The embedding of samples at inputs (n, ds + da), in few pivots where these suffice."""
+    pivoted = PivotedEmbedding.fit(kernel, inputs, regulariser)
+    return pivoted or KernelEmbedding.fit(kernel, inputs, regulariser)
+
+
 @dataclass(frozen=True)
 class RegressionSums:
     """Sums over samples that determine a linear regression; those of chunks add up.

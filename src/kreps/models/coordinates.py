@@ -18,7 +18,7 @@ from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import KernelExpansion
 from kreps.kernels.kernel import Kernel
-from kreps.kernels.regression import KernelEmbedding, PivotedEmbedding
+from kreps.kernels.regression import embedding_of
 from kreps.models.transition import embedding_hyperparameters, fit_regression, state_actions
 
 LOG_LENGTHSCALE_STD = 2.0
@@ -102,10 +102,9 @@ def fit_coordinates(
     for group in _groups(targets, task):
         target = targets[:, group]
         kernel, regulariser, _ = embedding_hyperparameters(
-            inputs, target, state_kernel, task, None, of_own, (x,), LOG_LENGTHSCALE_STD
+            inputs, target, state_kernel, task, x, of_own, LOG_LENGTHSCALE_STD
         )
-        model = PivotedEmbedding.fit(kernel, inputs, regulariser)
-        single = model or KernelEmbedding.fit(kernel, inputs, regulariser)
+        single = embedding_of(kernel, inputs, regulariser)
         new = single.leave_one_out(target).errors
         if np.sum(new**2) < MAX_ERROR_RATIO * np.sum(errors[:, group] ** 2):
             errors[:, group] = new

@@ -311,8 +311,13 @@ class ModelEnv:
     def similarity_slopes(
         self, states: FloatArray, nearest: IntArray, factor: FloatArray
     ) -> FloatArray:
-        """Derivatives (m, ds) of the similarity to the nearest samples, times a factor (m,)
-        over the similarity."""
+        """Derivatives (m, ds) of the logarithm of the similarity to a sample, times a factor.
+
+        Args:
+            states: (m, ds).
+            nearest: (m,) the samples.
+            factor: (m,) such as the similarity, for the derivatives of itself.
+        """
         mean, samples = self._samples
         apart = self.kernel.embed(states) - mean - samples[:-1, nearest].T
         return self.kernel.pullback(states, -(factor[:, None] * apart)[:, None])[:, 0]

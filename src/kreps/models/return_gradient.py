@@ -79,7 +79,7 @@ class FixedNoise:
             env: the model.
             policy: with its exploration noise.
             count: m.
-            rng: in the state in which `ModelEnv.evaluate` begins.
+            rng: draws them in the order of `ModelEnv.evaluate`.
         """
         states, actions, signs = env.starts(count, rng), [], []
         starts, scale = states, env.task.action_scale

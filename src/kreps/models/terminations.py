@@ -19,9 +19,8 @@ from kreps.kernels.hyperparameters import EmbeddingLoss, Prior, factor_distances
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.regression import (
     FeatureRegression,
-    KernelEmbedding,
-    PivotedEmbedding,
     RegressionSums,
+    embedding_of,
 )
 from kreps.kernels.sampling import effective_target_count, pps_subsample
 
@@ -119,8 +118,7 @@ def fit_terminations(
     kernel, regulariser = termination_hyperparameters(data, state_kernel, rng)
     successors = data.points[data.successor]
     terminated = targets_of(data)
-    pivoted = PivotedEmbedding.fit(kernel, successors, regulariser)
-    model = pivoted or KernelEmbedding.fit(kernel, successors, regulariser)
+    model = embedding_of(kernel, successors, regulariser)
     errors = model.leave_one_out(terminated).errors[:, 0]
     return Terminations(model.predictor(terminated), errors, model.factor.jitter)
 

@@ -14,7 +14,7 @@ from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.hyperparameters import EmbeddingLoss, Prior, factor_distances, minimise
 from kreps.kernels.kernel import Kernel, SquaredExponential, median_lengthscales, wrap_factors
-from kreps.kernels.regression import KernelEmbedding, PivotedEmbedding
+from kreps.kernels.regression import KernelEmbedding, PivotedEmbedding, embedding_of
 from kreps.kernels.sampling import effective_target_count, pps_subsample
 from kreps.settings import RKHS, Grid
 
@@ -194,7 +194,6 @@ class HyperparameterFit:
         task: TaskSpec,
         start: FloatArray | None,
         rng: np.random.Generator,
-        further_starts: tuple[FloatArray, ...] = (),
         log_lengthscale_std: float = LOG_LENGTHSCALE_STD,
     ) -> HyperparameterFit:
         """The problem for n samples; arguments as of `embedding_hyperparameters`."""
@@ -219,7 +218,7 @@ class HyperparameterFit:
         loss = EmbeddingLoss(distances, targets[rows], weights / weights.mean())
         noisy = np.append(median, np.log(REGULARISER_OF_NOISY_DATA))
         starts = (prior.centre, noisy) if start is None else (start, prior.centre, noisy)
-        return cls(Kernel(factors, np.exp(median)), loss, prior, (*starts, *further_starts))
+        return cls(Kernel(factors, np.exp(median)), loss, prior, starts)
 
     def solve(self) -> FloatArray:
         """Log hyper-parameters (g + da + 1,) with the smallest loss plus prior."""
@@ -233,7 +232,6 @@ def embedding_hyperparameters(
     task: TaskSpec,
     start: FloatArray | None,
     rng: np.random.Generator,
-    further_starts: tuple[FloatArray, ...] = (),
     log_lengthscale_std: float = LOG_LENGTHSCALE_STD,
 ) -> tuple[Kernel, float, FloatArray]:
     """Kernel and regulariser of a regression, by leave-one-out error (Eq. 4), and their logs.
@@ -246,11 +244,10 @@ def embedding_hyperparameters(
         task: number of action coordinates.
         start: log hyper-parameters (g + da + 1,) of the last fit, if there was one.
         rng: draws the samples of the fit.
-        further_starts: more of them.
         log_lengthscale_std: prior standard deviation of a log lengthscale.
     """
     fit = HyperparameterFit.from_samples(
-        inputs, targets, state_kernel, task, start, rng, further_starts, log_lengthscale_std
+        inputs, targets, state_kernel, task, start, rng, log_lengthscale_std
     )
     x = fit.solve()
     return fit.kernel.with_lengthscales(np.exp(x[:-1])), float(np.exp(x[-1])), x
@@ -294,5 +291,4 @@ def fit_regression(
     kernel, regulariser, x = embedding_hyperparameters(
         inputs, targets, state_kernel, task, start, rng
     )
-    pivoted = PivotedEmbedding.fit(kernel, inputs, regulariser)
-    return pivoted or KernelEmbedding.fit(kernel, inputs, regulariser), x
+    return embedding_of(kernel, inputs, regulariser), x
