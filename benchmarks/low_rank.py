@@ -1,4 +1,4 @@
-"""Low-rank updates: distance from the exact update, and cost.  Results are in docs/performance.md.
+"""Low-rank updates: distance from the exact update, and cost: docs/results/low_rank.md.
 
 python benchmarks/low_rank.py accuracy    # distance of one update from the exact one, by rank
 python benchmarks/low_rank.py variance    # standard deviation of policies far from their data

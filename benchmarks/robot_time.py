@@ -74,7 +74,7 @@ def line(name: str, curves: list[Curve], mark: int, known: str, file: str) -> li
         robot_time(mark, period),
         value_at(curves, "greedy", mark),
         known,
-        f"[`{file}`](../results/{file})",
+        f"[`{file}`]({file})",
     ]
 
 

@@ -1,4 +1,4 @@
-"""Whole updates from smooth, nearly deterministic samples.  Results are in docs/performance.md.
+"""Updates from smooth, nearly deterministic samples.  Results: docs/results/low_rank.md.
 
 python benchmarks/smooth.py    # each row in a process of its own; CPU seconds, memory, outcome
 

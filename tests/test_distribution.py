@@ -95,7 +95,7 @@ def test_no_link_or_picture_of_the_project_page_is_relative(wheel: Built) -> Non
     links = [found[2] for found in LINK.findall(wheel.page)]
     assert [link for link in links if not link.startswith(("https://", "#"))] == []
     assert "](" not in wheel.page.replace("](https://", "")
-    assert "low rank (`docs/performance.md`)" in wheel.page
+    assert "low rank (`docs/results/low_rank.md`)" in wheel.page
     assert "(Picture `docs/pictures/swing_up.gif` of the source distribution: " in wheel.page
 
 

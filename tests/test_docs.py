@@ -78,8 +78,7 @@ def tables_of(page: Path) -> list[str]:
 
 @pytest.mark.parametrize("page", [p for p in PAGES if tables_of(p)], ids=lambda page: page.name)
 def test_tables_show_what_the_result_files_hold(page: Path) -> None:
-    text = page.read_text()
-    assert filled(text) == text
+    assert filled(page) == page.read_text()
     for name in tables_of(page):
         table = (ROOT / "results" / f"{name}.md").read_text().strip()
         if name.endswith("-steps"):

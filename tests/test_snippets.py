@@ -130,7 +130,7 @@ def of_readme() -> dict[str, Any]:
     }
 
 
-def of_performance() -> dict[str, Any]:
+def of_low_rank() -> dict[str, Any]:
     kreps.save_rollouts(recordings(), Path("recordings/0.safetensors"))
     return {"kreps": kreps, "task": TASK, "ProcessPoolExecutor": ThreadPoolExecutor}
 
@@ -197,7 +197,7 @@ TAKEN_FOR_GRANTED: dict[str, Callable[[], dict[str, Any]]] = {
     "docs/how_to/export.md": of_export,
     "docs/how_to/loggers.md": of_loggers,
     "docs/how_to/tuning.md": of_tuning,
-    "docs/performance.md": of_performance,
+    "docs/results/low_rank.md": of_low_rank,
     "docs/recorded_data.md": of_recorded_data,
     "docs/real_robot.md": lambda: {"kreps": kreps, **robot()},
 }

@@ -146,7 +146,8 @@ def test_every_result_has_a_command_that_renews_it() -> None:
 
 def test_pages_say_which_of_their_tables_are_stale(tmp_path: Path) -> None:
     (tmp_path / "one-steps.md").write_text("| a table |\n")
-    page = "<!-- results: one-steps -->\n<!-- end of results -->"
+    page = tmp_path / "page.md"
+    page.write_text("<!-- results: one-steps -->\n<!-- end of results -->")
     assert "Stale" not in filled(page, tmp_path)
     (tmp_path / "stale.json").write_text('{"one": "kreps reproduce one"}')
     note = (
@@ -154,7 +155,18 @@ def test_pages_say_which_of_their_tables_are_stale(tmp_path: Path) -> None:
         "To renew: `kreps reproduce one`.*"
     )
     assert note in filled(page, tmp_path)
-    assert filled(filled(page, tmp_path), tmp_path) == filled(page, tmp_path)
+    page.write_text(filled(page, tmp_path))
+    assert filled(page, tmp_path) == page.read_text()
+
+
+def test_links_of_a_table_lead_from_the_page_to_the_results(tmp_path: Path) -> None:
+    (tmp_path / "results").mkdir()
+    (tmp_path / "results/one.md").write_text("| [all runs](one.csv), [theirs](https://a.org) |\n")
+    page = tmp_path / "docs/deep/page.md"
+    page.parent.mkdir(parents=True)
+    page.write_text("<!-- results: one -->\n<!-- end of results -->")
+    shown = "| [all runs](../../results/one.csv), [theirs](https://a.org) |"
+    assert shown in filled(page, tmp_path / "results")
 
 
 def test_the_trial_that_is_not_recorded_has_its_settings_but_no_code() -> None:
