@@ -3,7 +3,9 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test docs check bench format clean constraints tables dist
+SERIES := $(shell sed -n 's/^version = "\([0-9]*\.[0-9]*\)\..*/\1/p' pyproject.toml)
+
+.PHONY: demo test test-integrations docs docs-version check bench format clean constraints tables dist
 
 demo: .venv/installed           ## learn the swing-up; writes pictures and policy to runs/demo
 	rm -rf runs/demo
@@ -12,8 +14,22 @@ demo: .venv/installed           ## learn the swing-up; writes pictures and polic
 test: .venv/installed           ## all tests
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
+# These libraries are large and change often, so they are in no other environment.
+test-integrations:              ## tests beside Optuna, Stable-Baselines3, TensorBoard, W&B, MLflow and others
+	$(PYTHON) -m venv build/integrations
+	build/integrations/bin/python -m pip install --quiet --disable-pip-version-check pytest \
+	  -e ".[interop,mlflow,tensorboard,tune,wandb]"
+	build/integrations/bin/python -c "import huggingface_hub, mlflow, optuna, rliable, \
+	  sqlalchemy, stable_baselines3, tensorboard, wandb"
+	OPENBLAS_NUM_THREADS=1 build/integrations/bin/python -m pytest -rs \
+	  tests/test_callbacks.py tests/test_interop.py tests/test_tuning.py
+
 docs: .venv/installed           ## the documentation site in site/; a broken link is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
+
+docs-version: .venv/installed   ## commits the site of this version to the branch gh-pages; pushes nothing
+	export PATH="$(CURDIR)/$(BIN):$$PATH" DOCS_VERSIONS=mike NO_MKDOCS_2_WARNING=1 && \
+	  mike deploy --update-aliases $(SERIES) latest && mike set-default latest
 
 check: .venv/installed          ## formatter, linter, types, import contracts, stale results
 	$(BIN)/ruff format --check .
