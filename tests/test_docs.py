@@ -6,6 +6,7 @@ import csv
 import json
 import re
 import sys
+import tomllib
 from importlib import import_module
 from pathlib import Path
 
@@ -27,7 +28,7 @@ import stale_results  # noqa: E402
 import suite  # noqa: E402
 from fill_tables import filled  # noqa: E402
 
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
 PAPER_MAP = (ROOT / "docs/paper_map.md").read_text()
 MAPPED_NAMES = sorted(set(re.findall(r"`(kreps\.[\w.]+)`", PAPER_MAP)))
 
@@ -137,4 +138,26 @@ def test_the_public_names_exist() -> None:
 def test_version_agrees_everywhere() -> None:
     kreps = import_module("kreps")
     assert f'version = "{kreps.__version__}"' in (ROOT / "pyproject.toml").read_text()
-    assert f"version: {kreps.__version__}" in (ROOT / "CITATION.cff").read_text()
+    assert f"\nversion: {kreps.__version__}\n" in (ROOT / "CITATION.cff").read_text()
+    releases = re.findall(r"^## \[(\d.*?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert releases[0] == kreps.__version__
+
+
+def test_the_changelog_keeps_its_form() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text()
+    unreleased, *releases = re.findall(r"^## (.+)$", text, re.MULTILINE)
+    assert unreleased == "[Unreleased]" and releases
+    assert all(re.fullmatch(r"\[\d+\.\d+\.\d+\] - \d{4}-\d\d-\d\d", each) for each in releases)
+    kinds = {"Added", "Changed", "Deprecated", "Removed", "Fixed", "Security"}
+    for part in re.split(r"^## .+$", text, flags=re.MULTILINE)[1:]:
+        found = re.findall(r"^### (.+)$", part, re.MULTILINE)
+        assert len(found) == len(set(found)) and set(found) <= kinds
+
+
+def test_the_line_below_the_title_of_the_readme_is_true() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    versions = re.findall(r"Python :: (3\.\d+)", "\n".join(project["classifiers"]))
+    (status,) = re.findall(r"Status :: \d - (\w+)", "\n".join(project["classifiers"]))
+    pythons = f"{', '.join(versions[:-1])} and {versions[-1]}"
+    line = f"Python {pythons} | {project['license']} licence | {status.lower()} |"
+    assert (ROOT / "README.md").read_text().splitlines()[2].startswith(line)
