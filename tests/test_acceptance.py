@@ -19,12 +19,10 @@ from kreps.algorithms.acceptance import (
 from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.kernel import Kernel
 from kreps.models.dynamics import fit_dynamics
 from kreps.models.model_env import ModelEnv, ModelRollouts
-from kreps.models.novelty import MAX_RADIUS, NoveltyBonus
+from kreps.models.novelty import NoveltyBonus
 from kreps.models.reward_model import RewardModel
-from kreps.models.terminations import Terminations
 from kreps.models.transition import state_kernel
 from kreps.models.world_model import WorldModel
 from kreps.presets import settings_of
@@ -84,7 +82,6 @@ class ModelOfReturns(ModelEnv):
         zeros = np.zeros((1, count))
         return ModelRollouts(
             rewards=zeros + policy.mean * (1.0 + policy.risk * draws) + 100.0 * draws,
-            actions=zeros[:, :, None],
             similarity=zeros + policy.similarity,
             ended=zeros > 0.0,
         )
@@ -169,66 +166,10 @@ def test_a_difference_within_one_standard_error_is_accepted() -> None:
     assert np.mean(np.array(rejected, dtype=float)) == pytest.approx(0.165, abs=0.08)
 
 
-def test_a_policy_that_leaves_the_explored_region_is_rejected() -> None:
-    assert acceptance(Policy(2.0, similarity=0.5), Policy(1.0)) is True
-    # also if the previous policy has left it as far
-    assert acceptance(Policy(2.0, similarity=0.4), Policy(1.0, similarity=0.5)) is True
-    # where neither is near any sample, both have the reward of the worst state
-    assert acceptance(Policy(2.0, similarity=0.0), Policy(1.0, similarity=0.0)) is False
-
-
-def test_similarities_are_relative_to_the_typical_one_of_the_samples() -> None:
-    comparison = comparison_of()
-    assert comparison is not None
-    typical = comparison.typical
-    assert 0.8 < typical < 1.0
-    at_samples = comparison.returns(Policy(2.0))
-    as_typical = comparison.returns(Policy(2.0, similarity=typical))
-    np.testing.assert_array_equal(as_typical, at_samples)
-    # half as similar: half of the way from the reward of the worst state, which is -1000
-    halfway = comparison.returns(Policy(2.0, similarity=0.5 * typical))
-    np.testing.assert_allclose(halfway, 0.5 * (at_samples - 1000.0))
-
-
-def nearest_of_another_rollout(env: ModelEnv) -> FloatArray:
-    """Similarity (n,) of each sample to the nearest one of another rollout."""
-    similarity = env.kernel.gram(env.data.states, env.data.states)
-    similarity[env.data.rollout[:, None] == env.data.rollout] = 0.0
-    return similarity.max(axis=1)
-
-
-def typical_of(env: ModelEnv) -> float:
-    world = world_of(env, np.array([-1.0, 0.0]), lambda inputs: inputs[:, :1])
-    return ModelComparison(world, 2, 0).typical
-
-
-def test_the_typical_similarity_is_the_median_of_the_samples() -> None:
-    env = learnt_env()
-    median = np.median(nearest_of_another_rollout(env))
-    assert -np.log(median) < MAX_RADIUS * 2.0
-    assert typical_of(env) == pytest.approx(median, rel=1e-9)
-
-
-def test_the_typical_similarity_has_a_lower_limit() -> None:
-    env = learnt_env()
-    env = replace(env, kernel=Kernel(TASK.state_factors, 0.01 * env.kernel.lengthscales))
-    assert np.median(nearest_of_another_rollout(env)) < 0.5
-    assert typical_of(env) == pytest.approx(np.exp(-2.0 * MAX_RADIUS), rel=1e-12)
-
-
-def test_with_one_rollout_only_the_samples_themselves_are_typical() -> None:
-    env = learnt_env()
-    assert typical_of(replace(env, data=Transitions.from_rollouts(wheel(1)))) == 1.0
-
-
-def test_where_episodes_terminate_a_policy_may_leave_the_explored_region() -> None:
-    # living longer leads to new states, for which a policy must not be rejected
-    env = learnt_env()
-    ends = Terminations(lambda successors: np.zeros((len(successors), 1)), np.zeros(120), 0.0)
-    env = replace(env, dynamics=replace(env.dynamics, terminations=ends))
-    env = ModelOfReturns(**{field.name: getattr(env, field.name) for field in fields(env)})
-    assert acceptance(Policy(2.0, similarity=0.5), Policy(1.0), model_env=env) is False
-    assert acceptance(Policy(1.0, similarity=0.5), Policy(2.0), model_env=env) is True
+def test_a_policy_may_leave_the_explored_region() -> None:
+    # what is predicted there may be wrong, but then the rollouts of the policy say so
+    assert acceptance(Policy(2.0, similarity=0.0), Policy(1.0)) is False
+    assert acceptance(Policy(1.0, similarity=0.0), Policy(2.0)) is True
 
 
 def test_with_an_exploration_bonus_an_unexplored_region_pays_the_optimistic_reward() -> None:
@@ -280,22 +221,3 @@ def test_all_policies_of_a_comparison_have_the_same_random_numbers() -> None:
     gain = little_more - returns
     assert gain.mean() > 0.0 and gain.std() < 0.2 * returns.std()
     assert not np.allclose(other.returns(Push(0.1, 0.5)), returns)
-
-
-def test_the_cost_of_an_action_not_taken_does_not_make_new_states_look_worse() -> None:
-    """Samples have costly actions; the policy goes far from them with a free one."""
-
-    def reward(inputs: FloatArray) -> FloatArray:  # of the speed, less a cost of the push
-        return (0.1 * inputs[:, 1] - 5.0 * inputs[:, 2] ** 2)[:, None]
-
-    env = learnt_env()
-    world = replace(world_of(env, np.array([-9.0, 1.0]), reward), states=env.data.states)
-    comparison = ModelComparison(world, 2, seed=0)
-    slowest = float(env.data.states[:, 1].min())
-    model = world.reward_model
-    wanted = model.mean + 0.1 * slowest  # without any cost
-    found = comparison.in_worst_state(np.zeros((3, 2, 1)))
-    np.testing.assert_allclose(found, np.full((3, 2), wanted), rtol=1e-12)
-    # a costly action is as costly there as anywhere
-    costly = comparison.in_worst_state(np.ones((3, 2, 1)))
-    np.testing.assert_allclose(costly, np.maximum(found - 5.0, model.smallest), rtol=1e-12)

@@ -22,7 +22,6 @@ from kreps.data.window import ReplayWindow
 from kreps.errors import ConfigurationError, DataError
 from kreps.models.dynamics import fit_dynamics
 from kreps.models.history_choice import candidates, choose_history
-from kreps.models.model_env import ModelEnv
 from kreps.models.transition import state_actions, state_kernel
 
 TASK = TaskSpec(2, [-1.0], [3.0], periodic=(0,), delay=3, history=2, dt=0.05)
@@ -255,23 +254,6 @@ def test_a_change_of_states_keeps_the_window_alone() -> None:
 def test_settings_are_checked(settings: Any) -> None:
     with pytest.raises(ConfigurationError, match="whole number from 0 to 100"):
         kreps.KREPS(of_oscillator(), **settings)
-
-
-def test_model_rollouts_report_the_action_and_not_an_earlier_one() -> None:
-    """The acceptance test takes this action in the worst state."""
-    rollouts, rng = oscillator(6, delay=1), np.random.default_rng(0)
-    task = TaskSpec(2, [-1.0], [1.0], delay=2)
-    data = stacked(rollouts, task).transitions
-    kernel = state_kernel(data, task, rng)
-    dynamics, *_ = fit_dynamics(data, kernel, task, None, rng)
-    model = ModelEnv(dynamics, data, kernel, task, 0.1, 0.0, 10, 0.0)
-
-    class Half:
-        def act(self, states: np.ndarray, noise: np.ndarray) -> np.ndarray:
-            return np.full((len(states), 1), 0.5)
-
-    found = model.evaluate(Half(), lambda inputs, _: inputs[:, 0], 5, rng)
-    np.testing.assert_array_equal(found.actions, np.full((10, 5, 1), 0.5))
 
 
 def test_the_choice_from_a_data_set_of_small_chunks_is_that_of_its_rollouts() -> None:

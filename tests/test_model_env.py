@@ -28,7 +28,6 @@ TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]), periodic=(0,))
 
 STARTS = np.array([[3.0, 0.0], [-3.0, 0.5]])
 
-ALL_SIMILAR = Kernel(TASK.state_factors, np.array([1e9, 1e9]))
 """A kernel with which all states have similarity one."""
 
 
@@ -233,22 +232,14 @@ def angle(inputs: FloatArray, terminations: FloatArray) -> FloatArray:
     return inputs[:, 0]
 
 
-def average_rewards(
-    env: ModelEnv,
-    policy: Any,
-    reward: Any,
-    count: int,
-    smallest: float = -9.0,
-    typical: float = 1.0,
-) -> FloatArray:
+def average_rewards(env: ModelEnv, policy: Any, reward: Any, count: int) -> FloatArray:
     rollouts = env.evaluate(policy, reward, count, np.random.default_rng(0))
-    rewards = rollouts.pessimistic_rewards(np.full_like(rollouts.rewards, smallest), typical)
-    return average_reward(rewards, env.restart_probability)
+    return average_reward(rollouts.rewards, env.restart_probability)
 
 
 def test_a_step_counts_by_the_probability_that_no_restart_came_before_it() -> None:
     p, steps = 0.1, 20  # two mean lengths
-    env = model_env(restart_probability=p, kernel=ALL_SIMILAR)
+    env = model_env(restart_probability=p)
     found = average_rewards(env, Push(1.0), angle, 40)
     share = p * (1 - p) ** np.arange(steps) / (1 - (1 - p) ** steps)
     wanted = STARTS[:, 0] + 0.05 * share @ np.arange(steps)  # each push turns the wheel by 0.05
@@ -277,7 +268,7 @@ def test_an_evaluation_has_at_most_two_hundred_steps(p: float, steps: int) -> No
 
 
 def test_rewards_are_those_of_the_applied_actions() -> None:
-    env = model_env(kernel=ALL_SIMILAR)
+    env = model_env()
     found = average_rewards(env, Push(50.0), lambda inputs, _: inputs[:, 2], 3)
     np.testing.assert_allclose(found, 1.0)
 
@@ -324,18 +315,3 @@ def test_rollouts_from_one_seed_have_common_random_numbers() -> None:
     assert not np.allclose(other.rewards, one.rewards)
     with_other_numbers, _ = found(-1.0, seed=1)
     assert not np.allclose(with_other_numbers.rewards, one.rewards)
-
-
-def test_rewards_far_from_the_samples_are_shrunk_towards_the_smallest() -> None:
-    env = model_env(step=np.array([3.0, 0.0]), kernel=Kernel(TASK.state_factors, np.ones(2)))
-    policy = Push(2.0)  # three radians per step, at a speed that was observed
-    found = average_rewards(
-        env, policy, lambda inputs, _: np.full(len(inputs), 5.0), 4, smallest=-7.0, typical=0.8
-    )
-    similarity = np.array(
-        [env.kernel.gram(states, env.data.states).max(axis=1) for states in policy.steps]
-    )
-    assert similarity.min() < 0.6 and similarity.max() == pytest.approx(1.0)
-    share = (1 - env.restart_probability) ** np.arange(len(similarity))
-    wanted = share @ (-7.0 + 12.0 * np.minimum(similarity / 0.8, 1.0)) / share.sum()
-    np.testing.assert_allclose(found, wanted)

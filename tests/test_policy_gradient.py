@@ -150,27 +150,19 @@ def test_derivatives_of_successors_are_differences_of_them(name: str) -> None:
         np.testing.assert_allclose(slopes[:, :, j], (later - earlier) / (2.0 * step), atol=1e-5)
 
 
-@pytest.mark.parametrize("typical", [1e-300, 1.0])  # without and with pessimism
 @pytest.mark.parametrize("name", list(TASKS))
 def test_the_gradient_is_the_derivative_of_the_return(
-    name: str, typical: float, monkeypatch: pytest.MonkeyPatch
+    name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By changes of the policy's mean, through all steps; the limit against growth is off."""
     monkeypatch.setattr(return_gradient, "_adjoint_limits", lambda env, shares, *_: shares + np.inf)
-    compared = replace(comparison(name))
-    compared.__dict__["typical"] = typical
-    compared.__dict__["_worst_state"] = compared.world.states[0]
-    monkeypatch.setattr(  # the price of an action in the worst state is not differentiated
-        ModelComparison, "in_worst_state", lambda self, actions: np.full(actions.shape[:2], -3.0)
-    )
+    compared = comparison(name)
     env, policy = compared.from_starts, policy_of(name).predictor
     rng = np.random.default_rng(compared.seed)
     ascent = Ascent(compared, FixedNoise.of_policy(env, policy, 8, rng))
     value, record, rewards = ascent.evaluate(policy)
     if name == "ends":
         assert (record.alive[-1] < 0.9).any()
-    elif typical > 0.5:
-        assert (rewards.known < 1.0).any()
     assert (np.abs(record.commanded) < 1.0).all()
     gradient = action_gradient(env, policy, record, rewards)
     states = record.states.reshape(-1, TASKS[name].state_size)
@@ -209,7 +201,7 @@ def test_derivatives_do_not_grow_without_limit_in_an_unstable_loop() -> None:
     _, record, rewards = ascent.evaluate(steep)
     gradient = action_gradient(env, steep, record, rewards)
     assert np.isfinite(gradient).all()
-    slopes, _ = rewards.slopes(env, record)
+    slopes, _ = rewards.slopes(record)
     scale = env.data.states.std(axis=0)
     typical = np.sqrt(np.mean(np.sum((slopes[:, :, :2] * scale) ** 2, axis=2)))
     by_action = env.dynamics.jacobian(record.inputs.reshape(-1, 3))[:, :, 2:] / scale[:, None]

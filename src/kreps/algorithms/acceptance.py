@@ -5,12 +5,10 @@ use V, so policies are compared by them, with common random numbers.  Of the pol
 the best one is kept; the previous policy acts again where it is better by more than one standard
 error.
 
-Far from the samples the model predicts an average reward, which late in learning is a good one.
-So rewards of states that are unlike any sample are shrunk towards that of the same action in the
-worst sampled state; not towards the smallest reward observed, which may be due to the cost of an
-action that the policy does not take.  The explorer, which is optimised with the exploration bonus,
-gets that bonus there instead.  Rewards are not shrunk where episodes terminate: a policy that
-avoids the termination for longer visits new states, and would be rejected for it.
+Rewards are used as predicted, also in states that are unlike any sample: a reward of an unknown
+state that is too high is corrected by the rollouts that it attracts, and one that is shrunk towards
+bad rewards keeps policies near the samples (research record 23).  The explorer gets the exploration
+bonus there instead.
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ import numpy as np
 from kreps.algorithms.dual import MIN_ETA
 from kreps.kernels.arrays import FloatArray
 from kreps.models.model_env import ModelEnv, average_reward
-from kreps.models.novelty import novelty_radius
 from kreps.models.world_model import WorldModel
 from kreps.policies.base import StochasticPolicy
 from kreps.settings import ModelBased, Settings
@@ -62,12 +59,8 @@ class ModelComparison:
         world, model_env = self.world, self.from_starts
         rng = np.random.default_rng(self.seed)
         each = model_env.evaluate(policy, world.reward_model, self.rollouts, rng)
-        if world.bonus is not None:
-            rewards = world.bonus.optimistic_rewards(each)
-        elif model_env.dynamics.terminations is not None:
-            rewards = each.rewards
-        else:
-            rewards = each.pessimistic_rewards(self.in_worst_state(each.actions), self.typical)
+        bonus = world.bonus
+        rewards = each.rewards if bonus is None else bonus.optimistic_rewards(each)
         return average_reward(rewards, model_env.restart_probability)
 
     @cached_property
@@ -75,30 +68,6 @@ class ModelComparison:
         """The model whose rollouts all begin in start states, with what it computes only once."""
         assert self.world.model_env is not None
         return replace(self.world.model_env, exploring_starts=0.0)
-
-    @cached_property
-    def _worst_state(self) -> FloatArray:
-        """The sampled state (ds,) with the smallest predicted reward, all with the same action."""
-        states = self.world.states
-        same = np.zeros((len(states), self.world.task.action_size))  # the middle of the range
-        inputs = np.concatenate([states, same], axis=1)
-        rewards = self.world.reward_model(inputs, np.zeros(len(states)))
-        return states[int(np.argmin(rewards))]
-
-    def in_worst_state(self, actions: FloatArray) -> FloatArray:
-        """Predicted rewards (steps, count) of actions (steps, count, da) in the worst state."""
-        flat = actions.reshape(-1, actions.shape[-1])
-        states = np.broadcast_to(self._worst_state, (len(flat), len(self._worst_state)))
-        inputs = np.concatenate([states, flat], axis=1)
-        rewards = self.world.reward_model(inputs, np.zeros(len(flat)))
-        return rewards.reshape(actions.shape[:2])
-
-    @cached_property
-    def typical(self) -> float:
-        """Similarity from which on a reward is used as predicted: at the median novelty radius."""
-        assert self.world.model_env is not None
-        radius = novelty_radius(self.world.model_env, share=0.5)
-        return 1.0 if radius is None else float(np.exp(-radius))
 
 
 def standard_error(gain: FloatArray) -> float:

@@ -23,7 +23,6 @@ from kreps.models.model_env import step_shares
 from kreps.models.return_gradient import (
     TINY,
     FixedNoise,
-    Pessimism,
     RolloutRecord,
     StepRewards,
     action_gradient,
@@ -71,13 +70,9 @@ class Ascent:
 
     def evaluate(self, policy: SparseGP) -> tuple[float, RolloutRecord, StepRewards]:
         """The return of a policy, its rollouts and their rewards."""
-        comparison, env = self.comparison, self.comparison.from_starts
+        env = self.comparison.from_starts
         record = roll_out(env, policy, self.noise)
-        pessimism = None
-        if env.dynamics.terminations is None:
-            actions = record.inputs[:, :, record.states.shape[2] :]
-            pessimism = Pessimism(comparison.in_worst_state(actions), comparison.typical)
-        rewards = StepRewards.of(record, comparison.world.reward_model, pessimism)
+        rewards = StepRewards.of(record, self.comparison.world.reward_model)
         return float(average_return(env, record, rewards.values).mean()), record, rewards
 
     def direction(

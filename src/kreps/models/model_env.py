@@ -47,26 +47,13 @@ class ModelRollouts:
 
     Attributes:
         rewards: (steps, count) expected, standardised; after a termination that of no reward.
-        actions: (steps, count, da) applied, in units of their scale.
         similarity: (steps, count) of each state to its nearest sample: the kernel's value, up to 1.
         ended: (steps, count) whether the episode had terminated at an earlier step.
     """
 
     rewards: FloatArray
-    actions: FloatArray
     similarity: FloatArray
     ended: BoolArray
-
-    def pessimistic_rewards(self, worst: FloatArray, typical: float) -> FloatArray:
-        """Rewards (steps, count), shrunk towards worse ones where no sample is similar.
-
-        Args:
-            worst: (steps, count) reward of the same action in the worst sampled state.
-            typical: similarity from which on a reward is used as predicted.
-        """
-        worst = np.minimum(worst, self.rewards)
-        known = np.minimum(self.similarity / typical, 1.0)
-        return worst + known * (self.rewards - worst)
 
 
 def average_reward(rewards: FloatArray, restart_probability: float) -> FloatArray:
@@ -210,7 +197,6 @@ class ModelEnv:
         rewards = reward(np.concatenate(inputs), np.concatenate(terminations)).reshape(steps, count)
         return ModelRollouts(
             rewards=np.where(np.stack(ended), self.end_reward, rewards),
-            actions=np.stack(inputs)[:, :, self.task.state_size :],
             similarity=np.stack(similarity),
             ended=np.stack(ended),
         )
@@ -307,20 +293,6 @@ class ModelEnv:
         """Where the coordinates of states would not be clipped."""
         low, high = self._range
         return (states > low) & (states < high)
-
-    def similarity_slopes(
-        self, states: FloatArray, nearest: IntArray, factor: FloatArray
-    ) -> FloatArray:
-        """Derivatives (m, ds) of the logarithm of the similarity to a sample, times a factor.
-
-        Args:
-            states: (m, ds).
-            nearest: (m,) the samples.
-            factor: (m,) such as the similarity, for the derivatives of itself.
-        """
-        mean, samples = self._samples
-        apart = self.kernel.embed(states) - mean - samples[:-1, nearest].T
-        return self.kernel.pullback(states, -(factor[:, None] * apart)[:, None])[:, 0]
 
     @cached_property
     def _range(self) -> tuple[FloatArray, FloatArray]:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from kreps.kernels.arrays import FloatArray, IntArray
+from kreps.kernels.arrays import FloatArray
 from kreps.models.model_env import ModelEnv, RolloutNoise, step_shares
 from kreps.models.reward_model import RewardModel
 from kreps.policies.sparse_gp import SparseGP
@@ -38,8 +38,6 @@ class RolloutRecord:
         states: (steps, m, ds).
         inputs: (steps, m, ds + da) states and scaled, applied actions.
         commanded: (steps, m, da) scaled actions before they were clipped.
-        nearest: (steps, m) the sample nearest to each state.
-        similarity: (steps, m) to it.
         successors: (steps, m, ds) before they were clipped to the range of the data.
         terminations: (steps, m) probabilities of a termination.
         alive: (steps, m) probability that the episode has not terminated before.
@@ -48,8 +46,6 @@ class RolloutRecord:
     states: FloatArray
     inputs: FloatArray
     commanded: FloatArray
-    nearest: IntArray
-    similarity: FloatArray
     successors: FloatArray
     terminations: FloatArray
     alive: FloatArray
@@ -93,31 +89,17 @@ class FixedNoise:
 
 def roll_out(env: ModelEnv, policy: SparseGP, noise: FixedNoise) -> RolloutRecord:
     """Rollouts of the mean of a policy with given noise; episodes go on after their end."""
-    rows: list[tuple[FloatArray | IntArray, ...]] = []
+    rows: list[tuple[FloatArray, ...]] = []
     states, alive = noise.starts, np.ones(len(noise.starts))
     for added, signs in zip(noise.actions, noise.residual_signs, strict=True):
         commanded = policy.scaled_mean(states) + added
         applied = env.task.scaled_applied(env.task.unscaled(commanded))
         inputs = np.concatenate([states, applied], axis=1)
-        nearest, similarity = env.nearest(states)
+        nearest, _ = env.nearest(states)
         successors, terminations = env.dynamics.sample(nearest, inputs, signs)
-        each = (states, inputs, commanded, nearest, similarity, successors, terminations, alive)
-        rows.append(each)
+        rows.append((states, inputs, commanded, successors, terminations, alive))
         states, alive = env.within_range(successors), alive * (1.0 - terminations)
     return RolloutRecord(*(np.stack(part) for part in zip(*rows, strict=True)))
-
-
-@dataclass(frozen=True)
-class Pessimism:
-    """Towards which rewards those of states unlike any sample are shrunk.
-
-    Attributes:
-        worst: (steps, m) reward of the same action in the worst sampled state.
-        typical: similarity from which on a reward is used as predicted.
-    """
-
-    worst: FloatArray
-    typical: float
 
 
 @dataclass(frozen=True)
@@ -125,61 +107,31 @@ class StepRewards:
     """Rewards of a `RolloutRecord`.
 
     Attributes:
-        predicted: (steps, m) expected, standardised, as if no episode had ended.
-        worst: (steps, m) towards which they are shrunk.
-        known: (steps, m) by how much they are not, from 0 to 1.
+        values: (steps, m) expected, standardised, as if no episode had ended.
         model: of the rewards.
     """
 
-    predicted: FloatArray
-    worst: FloatArray
-    known: FloatArray
+    values: FloatArray
     model: RewardModel
 
     @classmethod
-    def of(
-        cls, record: RolloutRecord, model: RewardModel, pessimism: Pessimism | None
-    ) -> StepRewards:
-        """Rewards as predicted, or shrunk towards worse ones in states unlike any sample.
-
-        Args:
-            record: rollouts.
-            model: of the rewards.
-            pessimism: None for rewards as predicted.
-        """
+    def of(cls, record: RolloutRecord, model: RewardModel) -> StepRewards:
+        """The rewards that a model predicts."""
         inputs = record.inputs.reshape(-1, record.inputs.shape[2])
-        predicted = model(inputs, record.terminations.reshape(-1)).reshape(record.alive.shape)
-        if pessimism is None:
-            return cls(predicted, predicted, np.ones_like(predicted), model)
-        known = np.minimum(record.similarity / pessimism.typical, 1.0)
-        return cls(predicted, np.minimum(pessimism.worst, predicted), known, model)
+        values = model(inputs, record.terminations.reshape(-1)).reshape(record.alive.shape)
+        return cls(values, model)
 
-    @property
-    def values(self) -> FloatArray:
-        """Rewards (steps, m)."""
-        values: FloatArray = self.worst + self.known * (self.predicted - self.worst)
-        return values
-
-    def slopes(self, env: ModelEnv, record: RolloutRecord) -> tuple[FloatArray, FloatArray]:
+    def slopes(self, record: RolloutRecord) -> tuple[FloatArray, FloatArray]:
         """Derivatives of the rewards.
 
         Returns:
             Those by states and scaled, applied actions (steps, m, ds + da), and those by the
             probability of a termination (steps, m).
         """
-        steps, count, width = record.inputs.shape
-        size = record.states.shape[2]
-        inputs, known = record.inputs.reshape(-1, width), self.known.reshape(-1)
-        slopes = self.model.jacobian(inputs, self.predicted.reshape(-1))
+        inputs = record.inputs.reshape(-1, record.inputs.shape[2])
+        slopes = self.model.jacobian(inputs, self.values.reshape(-1))
         by_termination = np.where(slopes.any(axis=1), self.model.at_termination, 0.0)
-        if (known < 1.0).any():
-            by_state = env.similarity_slopes(
-                inputs[:, :size], record.nearest.reshape(-1), known * (known < 1.0)
-            )
-            # the price of an action is the same in the worst state
-            slopes[:, :size] *= known[:, None]
-            slopes[:, :size] += (self.predicted - self.worst).reshape(-1, 1) * by_state
-        return slopes.reshape(steps, count, width), by_termination.reshape(steps, count)
+        return slopes.reshape(record.inputs.shape), by_termination.reshape(record.alive.shape)
 
 
 def average_return(env: ModelEnv, record: RolloutRecord, rewards: FloatArray) -> FloatArray:
@@ -209,7 +161,7 @@ def action_gradient(
     of_policy = policy.mean_jacobian(flat).reshape(steps, count, -1, size)
     of_termination = _termination_slopes(env, record)
     inside = env.is_within_range(record.successors)
-    of_reward, reward_by_termination = rewards.slopes(env, record)
+    of_reward, reward_by_termination = rewards.slopes(record)
     values = rewards.values
     limits = _adjoint_limits(env, shares, values, of_reward, of_termination)
     scale = env.data.states.std(axis=0)
