@@ -301,7 +301,11 @@ def test_the_model_based_step_at_full_rank_is_that_of_an_exact_update(
     settings = settings_of(
         model=model,
         value=value,
-        **{"model_based.improvement_steps": 0, "model_based.gradient_steps": 0},
+        **{
+            "model_based.improvement_steps": 0,
+            "model_based.random_policies": 0,
+            "model_based.gradient_steps": 0,
+        },
     )
     state, found = LearnerState(ReplayWindow(TASK, None)), []
     window = state.append(ended)

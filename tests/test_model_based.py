@@ -230,7 +230,11 @@ def test_each_step_starts_from_v_of_the_step_before_and_a_temperature_of_one(
 def test_an_update_is_algorithm_1_and_the_two_generated_steps(low_rank: LowRank | None) -> None:
     """The same random numbers give the same bytes."""
     state = LearnerState(ReplayWindow(TASK, 30))
-    steps = {"model_based.improvement_steps": 0, "model_based.gradient_steps": 0}
+    steps = {
+        "model_based.improvement_steps": 0,
+        "model_based.random_policies": 0,
+        "model_based.gradient_steps": 0,
+    }
     settings = settings_of(low_rank=low_rank, **steps)
     after, info = update(state, turns(), settings, np.random.default_rng(3), Compute())
     case = Case.learnt(low_rank=low_rank)

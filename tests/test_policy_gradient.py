@@ -16,6 +16,7 @@ from kreps.algorithms.policy_gradient import (
     improve,
     natural_direction,
 )
+from kreps.algorithms.random_policies import RandomLinear, best_random_policy
 from kreps.data.history import stacked
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
@@ -230,7 +231,7 @@ def test_a_direction_changes_the_actions_by_one_and_follows_the_gradient() -> No
 @pytest.mark.parametrize("name", list(TASKS))
 def test_the_ascent_raises_the_return_and_keeps_the_noise(name: str) -> None:
     compared, policy = comparison(name), policy_of(name)
-    improved = improve(compared, policy, 10)
+    improved = improve(compared, policy.predictor, 10)
     assert isinstance(improved, SparseGP)
     noise = FixedNoise.of_policy(
         compared.from_starts, policy.predictor, 8, np.random.default_rng((compared.seed, GRADIENT))
@@ -243,7 +244,7 @@ def test_the_ascent_raises_the_return_and_keeps_the_noise(name: str) -> None:
     np.testing.assert_allclose(
         improved.standard_deviation(states), policy.standard_deviation(states), rtol=1e-9
     )
-    again = improve(compared, policy, 10)
+    again = improve(compared, policy.predictor, 10)
     np.testing.assert_array_equal(again.mean_weights, improved.mean_weights)
 
 
@@ -259,3 +260,37 @@ def test_without_steps_or_gain_the_policy_stays() -> None:
     indifferent = replace(compared, world=replace(compared.world, reward_model=flat))
     found = improve(indifferent, policy, 5)
     np.testing.assert_array_equal(found.mean_weights, policy.mean_weights)
+
+
+# ---- random policies --------------------------------------------------------------------------
+
+
+def test_random_policies_act_each_in_its_part_of_the_rows() -> None:
+    policy, states = policy_of("plain").predictor, comparison("plain").world.states
+    drawn = RandomLinear.draw(policy, states, 3, np.random.default_rng(0))
+    rows = np.tile(states[:5], (3, 1))
+    together = drawn.scaled(rows)
+    for k in range(3):
+        np.testing.assert_allclose(together[5 * k : 5 * k + 5], drawn.one(k).scaled(states[:5]))
+    assert not np.allclose(together[:5], together[5:10])
+    # in the task's units, which are those of the scaled action times two
+    np.testing.assert_allclose(drawn.act(rows, np.zeros((15, 1))), 2.0 * together)
+    many = RandomLinear.draw(policy, states, 200, np.random.default_rng(1))
+    at_limits = np.abs(many.scaled(np.repeat(states[:1], 200, axis=0))) >= 1.0
+    assert 0.5 < at_limits.mean() < 0.95
+
+
+def test_the_best_of_random_policies_leaves_a_local_optimum() -> None:
+    """A policy that pushes the wrong way as hard as it can: gradients vanish at the limits."""
+    compared, policy = comparison("plain"), policy_of("plain").predictor
+    stuck = replace(policy, mean_weights=-50.0 * policy.mean_weights)
+    rng = np.random.default_rng(0)
+    found = best_random_policy(compared, stuck, 20, rng)
+    np.testing.assert_array_equal(found.states, stuck.states)
+    states = compared.world.states[:20]
+    np.testing.assert_array_equal(
+        found.standard_deviation(states), stuck.standard_deviation(states)
+    )
+    best = compared.returns(found).mean()
+    assert best > compared.returns(stuck).mean() + 0.1
+    assert best > compared.returns(improve(compared, stuck, 10)).mean()

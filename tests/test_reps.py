@@ -410,7 +410,11 @@ def test_a_single_distinct_action_is_learnt(preset: str) -> None:
     assert_bounded(info, settings)
     assert_usable(state)
     if settings.model_based is not None:  # without the bonus of unexplored actions
-        without = {"model_based.exploration_bonus": 0.0, "model_based.gradient_steps": 0}
+        without = {
+            "model_based.exploration_bonus": 0.0,
+            "model_based.random_policies": 0,
+            "model_based.gradient_steps": 0,
+        }
         settings = settings_of(settings, **without)
     state, info = run(same, settings)
     assert isinstance(state.policy, CostSensitiveGP)

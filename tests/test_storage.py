@@ -40,7 +40,12 @@ SETTINGS: dict[str, dict[str, Any]] = {
     method: {"restart_probability": 0.1, **TINY} for method in LEARNERS
 } | {
     # a gradient step leaves a policy of few centres, which is a variant of its own
-    "reps": {"restart_probability": 0.1, **TINY, "model_based.gradient_steps": 0},
+    "reps": {
+        "restart_probability": 0.1,
+        **TINY,
+        "model_based.random_policies": 0,
+        "model_based.gradient_steps": 0,
+    },
     "grid-value-iteration": {
         "ranges": ((-3.0, 3.0), (-8.0, 8.0)),
         "grid_states": 4,

@@ -124,6 +124,8 @@ class ModelBased(Checked):
         improvement_steps: largest number of further steps in states that model rollouts of the
             newest policy visit.  They end after three in a row without a gain in the model, and
             the best policy is kept.  There are none without an acceptance test.
+        random_policies: number of random linear policies of an update whose best one is kept if its
+            return in the model is larger; 0 for none.  There are none without an acceptance test.
         gradient_steps: largest number of steps by the gradient of the return in model rollouts,
             from the best policy on; 0 for none.  There are none without an acceptance test.
         max_samples: largest number of generated actions of an update.
@@ -135,6 +137,7 @@ class ModelBased(Checked):
     acceptance_rollouts: int = 50
     exploration_bonus: float = 0.1
     improvement_steps: int = 20
+    random_policies: int = 20
     gradient_steps: int = 40
     max_samples: int = 20_000
 
@@ -147,6 +150,6 @@ class ModelBased(Checked):
             "acceptance_rollouts", Integral, none_or_some, lambda v: v == 0 or 2 <= v <= MAX_COUNT
         )
         steps = f"a whole number from 0 to {MAX_COUNT}"
-        for name in ("improvement_steps", "gradient_steps"):
+        for name in ("improvement_steps", "random_policies", "gradient_steps"):
             self._check(name, Integral, steps, lambda v: 0 <= v <= MAX_COUNT)
         self._check("exploration_bonus", Real, "finite and >= 0", lambda v: 0 <= v < inf)

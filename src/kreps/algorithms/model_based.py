@@ -3,9 +3,9 @@
 This is the idea of Dyna (Sutton 1990).  In a first step states are resampled by the weights of
 Algorithm 1, in the others they are visited in model rollouts of the policy of the step before.  In
 each state several actions are sampled around the policy's, and weighted by the same dual.  These
-steps go on while the model predicts a larger return, and the best policy is kept.  Steps by the
-gradient of that return follow on it.  It acts only if it passes an acceptance test against the
-previous one.
+steps go on while the model predicts a larger return, and the best policy is kept, or a random one
+that is better.  Steps by the gradient of that return follow on it.  It acts only if it passes an
+acceptance test against the previous one.
 
 While there is an exploration bonus, an explorer is optimised with it by bounded steps.  It collects
 half of the next rollouts, and is neither tested nor reported: the acting policy is the best known,
@@ -30,6 +30,7 @@ from kreps.algorithms.ends import AbsorbingEnd, solve_with_end
 from kreps.algorithms.generated import GeneratedSamples, StateSource, generate, split_budget
 from kreps.algorithms.policy_gradient import improve
 from kreps.algorithms.policy_targets import PolicyFit, PolicyTargets
+from kreps.algorithms.random_policies import best_random_policy
 from kreps.algorithms.reps import Batch, Step, stationarity_ridge
 from kreps.algorithms.state import LearnerState
 from kreps.kernels.arrays import FloatArray
@@ -133,8 +134,9 @@ def model_based_step(
     seed = int(rng.integers(2**63))  # all policies of an update have the same random numbers
     comparison = compare_in_model(world, model_based.acceptance_rollouts, seed)
     best, returns = optimise(batch, world, step, comparison, rng)
-    if comparison is not None and returns is not None and model_based.gradient_steps:
-        best, returns = ascended(batch, best, returns, comparison)
+    if comparison is not None and returns is not None:
+        best, returns = or_random(batch, best, returns, comparison, rng)
+        best, returns = or_ascended(batch, best, returns, comparison)
     rejected = None
     if comparison is not None and returns is not None and state.policy is not None:
         gain = returns - comparison.returns(state.policy)
@@ -143,7 +145,10 @@ def model_based_step(
     explorer = None
     if optimistic.bonus is not None:
         comparison = compare_in_model(optimistic, model_based.acceptance_rollouts, seed)
-        explorer = optimise(batch, optimistic, step, comparison, rng)[0].policy.policy
+        found, returns = optimise(batch, optimistic, step, comparison, rng)
+        if comparison is not None and returns is not None:
+            found, _ = or_random(batch, found, returns, comparison, rng)
+        explorer = found.policy.policy
     step = replace(step, dual=best.dual, policy=best.policy, reward_model=world.reward_model)
     return ModelBasedResult(step, reward_start, rejected, explorer)
 
@@ -195,7 +200,26 @@ def optimise(
     return best, returns
 
 
-def ascended(
+def or_random(
+    batch: Batch[Any, Any],
+    best: GeneratedStep,
+    returns: FloatArray,
+    comparison: ModelComparison,
+    rng: np.random.Generator,
+) -> tuple[GeneratedStep, FloatArray]:
+    """A random policy in place of that of a step, if its returns (rollouts,) are larger."""
+    model_based = batch.settings.model_based
+    assert model_based is not None
+    if not model_based.random_policies:
+        return best, returns
+    policy = sparse(best.policy.policy)
+    drawn = best_random_policy(comparison, policy, model_based.random_policies, rng)
+    found = better(best, returns, drawn, comparison)
+    batch.clock.lap("random policies")
+    return found
+
+
+def or_ascended(
     batch: Batch[Any, Any],
     best: GeneratedStep,
     returns: FloatArray,
@@ -205,15 +229,30 @@ def ascended(
 
     They are compared on other starts and noise than those of the ascent.
     """
-    model_based, policy = batch.settings.model_based, best.policy.policy
+    model_based = batch.settings.model_based
     assert model_based is not None
-    assert isinstance(policy, CostSensitiveGP | SparseGP)
-    improved = improve(comparison, policy, model_based.gradient_steps)
-    new_returns = comparison.returns(improved)
+    if not model_based.gradient_steps:
+        return best, returns
+    improved = improve(comparison, sparse(best.policy.policy), model_based.gradient_steps)
+    found = better(best, returns, improved, comparison)
     batch.clock.lap("policy gradient")
+    return found
+
+
+def better(
+    best: GeneratedStep, returns: FloatArray, policy: SparseGP, comparison: ModelComparison
+) -> tuple[GeneratedStep, FloatArray]:
+    """A step with its returns (rollouts,), or with another policy if this has a larger mean."""
+    new_returns = comparison.returns(policy)
     if new_returns.mean() <= returns.mean():
         return best, returns
-    return replace(best, policy=replace(best.policy, policy=improved)), new_returns
+    return replace(best, policy=replace(best.policy, policy=policy)), new_returns
+
+
+def sparse(policy: LearntPolicy) -> SparseGP:
+    """A policy on the centres that it is evaluated with."""
+    assert isinstance(policy, CostSensitiveGP | SparseGP)
+    return policy.predictor if isinstance(policy, CostSensitiveGP) else policy
 
 
 def generated_step(

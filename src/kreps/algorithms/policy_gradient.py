@@ -30,7 +30,6 @@ from kreps.models.return_gradient import (
     limited,
     roll_out,
 )
-from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 from kreps.policies.sparse_gp import SparseGP
 
 FIRST_STEP, SMALLEST_STEP = 0.05, 0.003
@@ -114,9 +113,7 @@ def natural_direction(
     return direction
 
 
-def improve(
-    comparison: ModelComparison, policy: CostSensitiveGP | SparseGP, steps: int
-) -> SparseGP:
+def improve(comparison: ModelComparison, policy: SparseGP, steps: int) -> SparseGP:
     """The policy after at most ``steps`` steps, with the exploration noise that it had.
 
     Args:
@@ -124,7 +121,7 @@ def improve(
         policy: from which the ascent starts.
         steps: that are tried.
     """
-    best = _in_row_order(policy.predictor if isinstance(policy, CostSensitiveGP) else policy)
+    best = _in_row_order(policy)
     env = comparison.from_starts
     rng = np.random.default_rng((comparison.seed, GRADIENT))
     ascent = Ascent(comparison, FixedNoise.of_policy(env, best, comparison.rollouts, rng))
