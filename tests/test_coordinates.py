@@ -68,7 +68,7 @@ def test_predictions_are_those_of_the_part_of_each_column() -> None:
     assert found.shape == errors.shape
     assert sorted(j for columns in regression.columns for j in columns) == [0, 1, 2]
     for columns, part in zip(regression.columns, regression.parts, strict=True):
-        np.testing.assert_array_equal(found[:, columns], part(inputs))
+        np.testing.assert_allclose(found[:, columns], part(inputs), rtol=1e-9, atol=1e-11)
     # in the data the regression is closer than without the sample itself
     targets = smooth_and_noise(samples())
     assert (root_mean_square(targets - found)[:2] <= root_mean_square(errors)[:2]).all()

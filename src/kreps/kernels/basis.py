@@ -102,16 +102,37 @@ class KernelExpansion:
 
         Those by the coordinates e are ``sum_j alpha_j k(s~_j, s) (e_j - e(s))``.
         """
-        e = self.kernel.embed(states)
+        origin = self.coordinates.mean(axis=0)  # a common shift, which reduces the rounding
+        known, e = self.coordinates - origin, self.kernel.embed(states) - origin
+        moments = moments_of_centres(known, self.alpha)
         slopes = np.empty((len(states), self.alpha.shape[1], e.shape[1]))
-        height = max(1, BLOCK_ENTRIES // max(len(self.coordinates), 1))
+        height = max(1, BLOCK_ENTRIES // max(len(known), 1))
         for first in range(0, len(states), height):  # so that products stay in the cache
             rows = slice(first, first + height)
-            k = gaussian_gram(e[rows], self.coordinates)
-            for j, alpha in enumerate(self.alpha.T):
-                terms = k * alpha
-                slopes[rows, j] = terms @ self.coordinates - terms.sum(axis=1)[:, None] * e[rows]
+            slopes[rows] = slopes_by_coordinates(gaussian_gram(e[rows], known), moments, e[rows])
         return self.kernel.pullback(states, slopes)
+
+
+def moments_of_centres(centres: FloatArray, alpha: FloatArray) -> FloatArray:
+    """What `slopes_by_coordinates` needs of centres (r, e) and weights (r, k): (r, k (e + 1))."""
+    extended = np.concatenate([centres, np.ones((len(centres), 1))], axis=1)
+    return (alpha[:, :, None] * extended[:, None]).reshape(len(centres), -1)
+
+
+def slopes_by_coordinates(
+    k: FloatArray, moments: FloatArray, coordinates: FloatArray
+) -> FloatArray:
+    """Derivatives ``sum_j alpha_j k_j (c_j - x)`` (m, k, e) of k functions by coordinates x.
+
+    Args:
+        k: (m, r) kernel values with the centres c_j.
+        moments: (r, k (e + 1)) of centres and weights (`moments_of_centres`).
+        coordinates: (m, e) x.
+    """
+    count, width = coordinates.shape
+    sums = (k @ moments).reshape(count, -1, width + 1)
+    slopes: FloatArray = sums[:, :, :-1] - sums[:, :, -1:] * coordinates[:, None]
+    return slopes
 
 
 @dataclass(frozen=True)

@@ -8,15 +8,18 @@ which is the one that can be predicted least.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
-from kreps.kernels.arrays import FloatArray
-from kreps.kernels.basis import KernelExpansion
+from kreps.kernels.arrays import FloatArray, default_errstate
+from kreps.kernels.basis import KernelExpansion, moments_of_centres, slopes_by_coordinates
+from kreps.kernels.gram import BLOCK_ENTRIES
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.regression import embedding_of
 from kreps.models.transition import embedding_hyperparameters, fit_regression, state_actions
@@ -44,7 +47,12 @@ class Regression(Protocol):
 
 @dataclass(frozen=True)
 class CoordinateRegressions:
-    """Regressions of different targets, side by side.
+    """Regressions of different targets on the same inputs, side by side.
+
+    All kernels are products of the same factors, ``exp(-(c - x)'W(c - x) / 2)`` in coordinates x at
+    lengthscale one, with a diagonal W of inverse squared lengthscales.  So x is computed once for
+    all of them, and what depends on the centres c alone once for all predictions: model rollouts
+    predict few inputs at a time, at which these would take more time than the kernel values.
 
     Attributes:
         columns: of each part, the targets that it predicts.
@@ -56,16 +64,94 @@ class CoordinateRegressions:
     parts: tuple[KernelExpansion, ...]
     width: int
 
+    @default_errstate()
     def __call__(self, inputs: FloatArray) -> FloatArray:
         predictions = np.empty((len(inputs), self.width))
-        for columns, part in zip(self.columns, self.parts, strict=True):
-            predictions[:, columns] = part(inputs)
+        embedded = self._embedded(inputs)
+        for columns, part in zip(self.columns, self._prepared, strict=True):
+            for rows, k in part.kernel_values(embedded):
+                predictions[rows, columns] = k.T @ part.alpha
         return predictions
 
+    @default_errstate()
     def jacobian(self, inputs: FloatArray) -> FloatArray:
-        slopes = np.empty((len(inputs), self.width, inputs.shape[1]))
-        for columns, part in zip(self.columns, self.parts, strict=True):
-            slopes[:, columns] = part.jacobian(inputs)
+        embedded = self._embedded(inputs)
+        slopes = np.empty((len(inputs), self.width, embedded.shape[1]))
+        for columns, part in zip(self.columns, self._prepared, strict=True):
+            for rows, k in part.kernel_values(embedded):
+                slopes[rows, columns] = part.slopes(k, embedded[rows])
+        return self._unit_kernel.pullback(inputs, slopes)
+
+    @cached_property
+    def _unit_kernel(self) -> Kernel:
+        kernel = self.parts[0].kernel
+        return kernel.with_lengthscales(np.ones(len(kernel.factors)))
+
+    @cached_property
+    def _origin(self) -> FloatArray:
+        """Mean coordinates (e,): a common shift, which reduces the rounding of inner products."""
+        origin: FloatArray = self._unit_kernel.embed(self.parts[0].centres).mean(axis=0)
+        return origin
+
+    def _embedded(self, inputs: FloatArray) -> FloatArray:
+        """Coordinates (m, e) at lengthscale one, around their origin."""
+        embedded: FloatArray = self._unit_kernel.embed(inputs) - self._origin
+        return embedded
+
+    @cached_property
+    def _prepared(self) -> tuple[_Part, ...]:
+        first = self.parts[0].centres[:1]
+        widths = [f.coordinates(first).shape[1] for f in self._unit_kernel.factors]
+        return tuple(
+            _Part(
+                np.repeat(part.kernel.lengthscales**-2.0, widths),
+                self._embedded(part.centres),
+                part.alpha,
+            )
+            for part in self.parts
+        )
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What one regression on r centres needs of them.
+
+    Attributes:
+        precision: (e,) inverse squared lengthscales W.
+        centres: (r, e) c at lengthscale one, around the origin.
+        alpha: (r, k) weights of k targets.
+    """
+
+    precision: FloatArray
+    centres: FloatArray
+    alpha: FloatArray
+
+    @cached_property
+    def _factor(self) -> FloatArray:
+        """Rows ``(W c, -c'W c / 2, 1)``, (r, e + 2)."""
+        scaled = self.centres * self.precision
+        half_squares = 0.5 * np.sum(scaled * self.centres, axis=1, keepdims=True)
+        return np.concatenate([scaled, -half_squares, np.ones_like(half_squares)], axis=1)
+
+    @cached_property
+    def _moments(self) -> FloatArray:
+        return moments_of_centres(self.centres, self.alpha)
+
+    def kernel_values(self, embedded: FloatArray) -> Iterator[tuple[slice, FloatArray]]:
+        """Kernel values (r, b) with inputs (m, e), in blocks of b that stay in the cache."""
+        count, width = embedded.shape
+        extended = np.empty((count, width + 2))  # (x, 1, -x'W x / 2)
+        extended[:, :width], extended[:, width] = embedded, 1.0
+        extended[:, width + 1] = -0.5 * ((embedded * embedded) @ self.precision)
+        size = max(1, BLOCK_ENTRIES // len(self._factor))
+        for first in range(0, count, size):
+            rows = slice(first, first + size)
+            k = self._factor @ extended[rows].T
+            yield rows, np.exp(k, out=k)
+
+    def slopes(self, k: FloatArray, embedded: FloatArray) -> FloatArray:
+        """Derivatives (b, k, e) by the coordinates, from kernel values (r, b) of inputs (b, e)."""
+        slopes: FloatArray = self.precision * slopes_by_coordinates(k.T, self._moments, embedded)
         return slopes
 
 
