@@ -164,3 +164,15 @@ def test_a_function_is_the_product_of_features_and_theta(
 def test_an_empty_array_of_states_has_an_empty_array_of_features(name: str) -> None:
     # A chunk in which all samples have weight zero passes no states.
     assert bases(states(80, 25))[name].features(np.empty((0, 2))).shape == (0, 16)
+
+
+@pytest.mark.parametrize("kind", ["kernel", "grid"])
+def test_mean_features_are_those_of_pairs_of_states(kind: str) -> None:
+    points, first, second = states(80, 12), states(7, 13), states(7, 14)
+    basis: Basis
+    if kind == "kernel":
+        basis, _ = RKHSBasis.fit(KERNEL, points, tolerance=1e-3, max_rank=40)
+    else:
+        basis, _ = RBFGrid.from_points(KERNEL.factors, points, 4)
+    wanted = 0.5 * (basis.features(first) + basis.features(second))
+    np.testing.assert_allclose(basis.mean_features(first, second), wanted, rtol=1e-8, atol=1e-10)

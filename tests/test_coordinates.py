@@ -117,3 +117,19 @@ def test_derivatives_are_those_of_the_predictions() -> None:
     for j, unit in enumerate(np.eye(4)):
         change = regression(points + step * unit) - regression(points - step * unit)
         np.testing.assert_allclose(slopes[:, :, j], change / (2.0 * step), atol=1e-5)
+
+
+def test_narrow_kernels_predict_the_same() -> None:
+    """Kernel values too small for a normal number are raised to ones without an effect."""
+    regression, _, inputs = fitted(smooth_and_noise(samples()))
+    narrow = tuple(
+        replace(part, kernel=part.kernel.with_lengthscales(1e-2 * part.kernel.lengthscales))
+        for part in regression.parts
+    )
+    found = replace(regression, parts=narrow)(inputs + 1e-3)
+    smallest = min(part.kernel.gram(inputs).min() for part in narrow)
+    assert smallest < 1e-300
+    for columns, part in zip(regression.columns, narrow, strict=True):
+        wanted = part(inputs + 1e-3)
+        assert np.abs(wanted).max() > 1e-3
+        np.testing.assert_allclose(found[:, columns], wanted, rtol=1e-7, atol=1e-11)

@@ -291,13 +291,14 @@ def generated_step(
         has_acceptance_test(batch),
         rng,
     )
-    # V changes little between the steps; but the temperature may have to rise, and starts at 1
+    # V changes little between the steps; but the temperature may have to rise, and starts at 1 or
+    # where it was if that is higher, as it is with a large exploration bonus
     _, dual, end = solve_with_end(
         samples.problem,
         samples.terminations,
         before.end,
         samples.rewards,
-        start=(1.0, before.dual.theta),
+        start=(max(1.0, before.dual.eta), before.dual.theta),
     )
     batch.clock.lap("generated samples")
     targets = PolicyTargets.from_generated(samples, dual.weights, batch.task)

@@ -11,6 +11,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+from scipy.linalg import blas
 
 from kreps.errors import ConfigurationError
 from kreps.kernels.arrays import Array, FloatArray, default_errstate, like, namespace
@@ -42,6 +43,10 @@ class Basis(Protocol):
 
     def features(self, states: Array) -> Array:
         """``phi``, (m, r), at states (m, ds)."""
+        ...
+
+    def mean_features(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        """``(phi(first) + phi(second)) / 2``, (m, r), at pairs of states (m, ds)."""
         ...
 
     def function(self, theta: FloatArray) -> LinearFunction:
@@ -175,6 +180,13 @@ class RKHSBasis:
         k = self.kernel.gram(like(self.pivots, states), states)
         return solve_lower(like(self.lower, states), k).T
 
+    def mean_features(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        pivots = self.kernel.embed(self.pivots)
+        k = gaussian_gram(self.kernel.embed(first), pivots)
+        k += gaussian_gram(self.kernel.embed(second), pivots)
+        # half of the transposed sum, solved in place
+        return blas.dtrsm(0.5, self.lower, k.T, lower=1, overwrite_b=1).T
+
     def function(self, theta: FloatArray) -> KernelExpansion:
         return KernelExpansion(self.kernel, self.pivots, solve_lower_transposed(self.lower, theta))
 
@@ -233,6 +245,10 @@ class RBFGrid:
 
     def features(self, states: Array) -> Array:
         return self.kernel.gram(like(self.centres, states), states).T
+
+    def mean_features(self, first: FloatArray, second: FloatArray) -> FloatArray:
+        mean: FloatArray = 0.5 * (self.features(first) + self.features(second))
+        return mean
 
     def function(self, theta: FloatArray) -> LinearFunction:
         return KernelExpansion(self.kernel, self.centres, theta)

@@ -32,6 +32,10 @@ MAX_ERROR_RATIO = 0.9
 """Largest mean squared leave-one-out error of a coordinate's own regression, relative to that of
 the shared one, at which it is used.  Predictions with one kernel cost less than with several."""
 
+SMALLEST_EXPONENT = -650.0
+"""Exponents below it are raised to it, as exponentials that are not normal numbers take ten times
+as long.  The kernel value, 1e-282, has no effect on a sum."""
+
 
 class Regression(Protocol):
     """A differentiable regression of k targets on d inputs."""
@@ -134,6 +138,12 @@ class _Part:
         return np.concatenate([scaled, -half_squares, np.ones_like(half_squares)], axis=1)
 
     @cached_property
+    def _is_narrow(self) -> bool:
+        """Whether exponents within the range of the centres reach `SMALLEST_EXPONENT`."""
+        squares = self.precision @ np.ptp(self.centres, axis=0) ** 2
+        return bool(-0.5 * squares < SMALLEST_EXPONENT)
+
+    @cached_property
     def _moments(self) -> FloatArray:
         return moments_of_centres(self.centres, self.alpha)
 
@@ -147,6 +157,8 @@ class _Part:
         for first in range(0, count, size):
             rows = slice(first, first + size)
             k = self._factor @ extended[rows].T
+            if self._is_narrow:
+                np.maximum(k, SMALLEST_EXPONENT, out=k)
             yield rows, np.exp(k, out=k)
 
     def slopes(self, k: FloatArray, embedded: FloatArray) -> FloatArray:

@@ -291,9 +291,10 @@ class Dynamics:
             batch = slice(first, first + PREDICTION_BATCH)
             successors, terminations = self.predict(inputs[batch])
             residuals = self.residuals[rows[batch]]
-            averaged = 0.5 * basis.features(successors + residuals)
-            averaged += 0.5 * basis.features(successors - residuals)
-            expected[batch] = with_terminations(averaged, terminations[:, None], restart)
+            averaged = basis.mean_features(successors + residuals, successors - residuals)
+            if self.terminations is not None:
+                averaged = with_terminations(averaged, terminations[:, None], restart)
+            expected[batch] = averaged
         return expected
 
 

@@ -239,8 +239,14 @@ class ModelEnv:
         noise: RolloutNoise,
     ) -> ModelStep:
         """One step from states (m, ds); starts after ends and restarts are left to the caller."""
+        return self.step_with(act(states, noise.action_noise), states, noise)
+
+    def step_with(
+        self, commanded: FloatArray, states: FloatArray, noise: RolloutNoise
+    ) -> ModelStep:
+        """`step` by commanded actions (m, da)."""
         nearest, similarity = self.nearest(states)
-        actions = self.task.scaled_applied(act(states, noise.action_noise))
+        actions = self.task.scaled_applied(commanded)
         inputs = np.concatenate([states, actions], axis=1)
         successors, terminations = self.dynamics.sample(nearest, inputs, noise.residual_signs)
         successors = self.within_range(successors)

@@ -78,12 +78,14 @@ class FixedNoise:
             rng: draws them in the order of `ModelEnv.evaluate`.
         """
         states, actions, signs = env.starts(count, rng), [], []
-        starts, scale = states, env.task.action_scale
+        starts = states
         for _ in range(env.evaluation_steps):
             noise = RolloutNoise.sample(count, env.task.action_size, rng)
-            actions.append(policy.standard_deviation(states) / scale * noise.action_noise)
+            mean, deviation = policy.scaled_mean_and_deviation(states)
+            actions.append(deviation * noise.action_noise)
             signs.append(noise.residual_signs)
-            states = env.step(policy.act, states, noise).successors
+            commanded = env.task.unscaled(mean + actions[-1])
+            states = env.step_with(commanded, states, noise).successors
         return cls(starts, np.stack(actions), np.stack(signs))
 
 

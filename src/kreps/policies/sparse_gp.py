@@ -170,6 +170,14 @@ class SparseGP:
         """Standard deviation (m, da) of the commanded action, in the task's units."""
         return self._deviation(self._covariances(states))[:, None] * self.task.action_scale
 
+    def scaled_mean_and_deviation(self, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Mean (m, da) and standard deviation (m, 1) of commanded actions at states (m, ds).
+
+        In units of the action scale, the mean around the centre.
+        """
+        k = self._covariances(states)
+        return self._mean(k), self._deviation(k)[:, None]
+
     def scaled_mean(self, states: FloatArray) -> FloatArray:
         """Mean action (m, da) at states (m, ds), around its centre in units of the action scale."""
         return self._mean(self._covariances(states))
@@ -183,8 +191,8 @@ class SparseGP:
         return self._covariances(states).T
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
-        k = self._covariances(states)
-        return self.task.unscaled(self._mean(k) + self._deviation(k)[:, None] * noise)
+        mean, deviation = self.scaled_mean_and_deviation(states)
+        return self.task.unscaled(mean + deviation * noise)
 
     def _covariances(self, states: FloatArray) -> FloatArray:
         """Kernel values (r, m) of the centres with states (m, ds).
