@@ -228,8 +228,8 @@ def test_the_search_takes_the_candidate_of_the_best_mean() -> None:
     trials = search.search_trials("reaching", "NPALP (default)")
     assert len({trial.name for of in trials for trial in of}) == len(trials) * len(search.SEEDS)
     rewards = np.random.default_rng(0).normal(size=(len(trials), len(search.SEEDS)))
-    rewards[3] = (5.0, -1.0)
-    rewards[4] = (1.0, 2.0)
+    rewards[2] = (6.0, -2.0, -2.0)
+    rewards[3] = (1.0, 3.0, 2.0)
     results = {
         trial.name: {
             "rows": [
@@ -242,7 +242,7 @@ def test_the_search_takes_the_candidate_of_the_best_mean() -> None:
     }
     found = search.outcome("reaching", "NPALP (default)", results)
     assert found["chosen"] == search.CANDIDATES["reaching"]["NPALP (default)"][3]
-    assert found["candidates"][4]["scores"] == [1.0, 2.0]
+    assert found["candidates"][3]["scores"] == [1.0, 3.0, 2.0]
 
 
 def test_the_committed_search_has_the_present_candidates() -> None:
