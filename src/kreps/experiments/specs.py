@@ -54,9 +54,7 @@ TASKS: dict[str, Task] = {
         {"exploration.noise": "gaussian", "exploration.scale": 0.05},
         ranges=((-4.0, 4.0), (-4.0, 4.0), (-8.0, 8.0), (-8.0, 8.0)),
     ),
-    "swing-up": Task(
-        "kreps/SwingUp-v0", 20, ranges=((-2.0, 5.0), (-12.0, 12.0)), episodes=EPISODES
-    ),
+    "swing-up": Task("kreps/SwingUp-v0", 20, ranges=((-2.0, 5.0), (-12.0, 12.0)), episodes=50),
     "images": Task("kreps/ImageSwingUp-v0", 15),
     # With the constants of the authors' scripts.
     "authors-reaching": Task(
@@ -66,7 +64,7 @@ TASKS: dict[str, Task] = {
         ranges=((-4.0, 4.0), (-4.0, 4.0), (-10.0, 10.0), (-10.0, 10.0)),
     ),
     "authors-swing-up": Task(
-        "kreps/AuthorsSwingUp-v0", 20, ranges=((-2.0, 5.0), (-20.0, 20.0)), episodes=EPISODES
+        "kreps/AuthorsSwingUp-v0", 20, ranges=((-2.0, 5.0), (-20.0, 20.0)), episodes=50
     ),
     "authors-images": Task("kreps/AuthorsImageSwingUp-v0", 20),
     # Not in the paper: more updates, other first policies, and two environments of Gymnasium.
