@@ -16,7 +16,7 @@ from scipy import stats
 from kreps.errors import StorageError
 from kreps.experiments import claims, verdicts
 from kreps.experiments.claims import CLAIMS, Claim, Kind
-from kreps.experiments.specs import FIGURES
+from kreps.experiments.specs import COLUMNS
 from kreps.experiments.statistics import (
     effect_of,
     holm_adjusted,
@@ -291,25 +291,33 @@ def test_measures() -> None:
     assert claims.whole(rows) == pytest.approx(4.9)
 
 
-def test_claims_name_curves_that_their_figures_show() -> None:
+def test_claims_name_curves_of_their_column() -> None:
     for claim in CLAIMS:
-        curves = FIGURES[claim.figure]
-        several = len({task for task, _ in curves}) > 1
+        curves = COLUMNS[claim.figure][claim.column]
+        several = claim.figure == "figure-2b"
         shown = {f"{method}, {task}" if several else method for task, method in curves}
         assert {claim.better, claim.worse} <= {*shown, None}
+        assert claim.margin > 0.0
+    texts = {(claim.column, number % 23): claim.text for number, claim in enumerate(CLAIMS)}
+    assert len(CLAIMS) == len(texts) == 46
+    for number in range(23):  # each is asked of both columns
+        assert texts[claims.AS_SCRIPTS, number] == texts[claims.AS_PRINTED, number]
 
 
 def test_claims_are_written_from_result_files(tmp_path: Path) -> None:
     assert write_claims(tmp_path) == []
     better, worse = [-0.2, -0.3, -0.25] * 4, [-0.5, -0.4, -0.5] * 4
-    rows = [*rows_with("kernel REPS", better), *rows_with("NPALP", worse)]
+    rows = [*rows_with("kernel REPS (paper)", better), *rows_with("NPALP (default)", worse)]
     with open(tmp_path / "figure-1a.csv", "w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
         writer.writerows(rows)
     assert [path.name for path in write_claims(tmp_path)] == ["claims.json", "claims.md"]
     found = json.loads((tmp_path / "claims.json").read_text())
-    assert {"kernel REPS - NPALP", "NPALP - kernel REPS"} <= {c["comparison"] for c in found}
+    assert {c["comparison"] for c in found} >= {
+        "kernel REPS (paper) - NPALP (default)",
+        "NPALP (default) - kernel REPS (paper)",
+    }
     assert "**confirmed**" in (tmp_path / "claims.md").read_text()
     (tmp_path / "figure-1a.csv").write_text("other,columns\n1,2\n")
     with pytest.raises(StorageError, match="figure-1a"):

@@ -168,14 +168,14 @@ def test_an_unexplored_region_is_absorbing_in_model_rollouts() -> None:
     known, unknown, half = 1.0, 0.0, np.exp(-0.5 * (1.0 + np.log(2.0)))
     similarity = np.array([[known, known], [known, half], [unknown, known], [known, known]])
     rewards = np.arange(8.0).reshape(4, 2)
-    never, actions = np.zeros((4, 2), dtype=bool), np.zeros((4, 2, 1))
-    found = bonus.optimistic_rewards(ModelRollouts(rewards, actions, similarity, never))
+    never = np.zeros((4, 2), dtype=bool)
+    found = bonus.optimistic_rewards(ModelRollouts(rewards, similarity, never))
     wanted = [[0.0, 1.0], [2.0, (3.0 + 7.0) / 2], [7.0, (5.0 + 7.0) / 2], [7.0, 7.0]]
     np.testing.assert_allclose(found, wanted, rtol=1e-12)
     # after a termination nothing more is absorbed; what was absorbed before stays
     ended = never.copy()
     ended[2:] = True
-    found = bonus.optimistic_rewards(ModelRollouts(rewards, actions, similarity, ended))
+    found = bonus.optimistic_rewards(ModelRollouts(rewards, similarity, ended))
     np.testing.assert_allclose(found, [*wanted[:2], [4.0, 6.0], [6.0, 7.0]], rtol=1e-12)
 
 

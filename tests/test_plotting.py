@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -479,17 +480,26 @@ def test_learning_curves_show_means_and_level_lines(tmp_path: Path) -> None:
         for iteration in (1, 2)
     ]
     data += [{**row, "method": "once"} for row in data if row["iteration"] == 1]
-    figure = experiment_plots.learning_curves(data, REFERENCES, "title", "source")
-    training, stochastic, greedy = figure.axes
-    of = {line.get_label(): line for line in stochastic.lines}
+    curves = {name: [row for row in data if row["method"] == name] for name in ("A", "once")}
+    column = experiment_plots.Column("left", "a task", curves, REFERENCES)
+    right = replace(column, title="right", period=0.05)
+    other = replace(column, title="other", task="another task", references={})
+    figure = experiment_plots.learning_curves([column, right, other], "title", "source")
+    upper, lower = figure.axes[:3], figure.axes[3:6]
+    of = {line.get_label(): line for line in upper[0].lines}
     np.testing.assert_allclose(np.asarray(of["A"].get_xdata(), dtype=float), [101.0, 201.0])
     np.testing.assert_allclose(np.asarray(of["A"].get_ydata(), dtype=float), [-39.0, -29.0])
-    in_training = {line.get_label(): line for line in training.lines}
-    np.testing.assert_allclose(np.asarray(in_training["A"].get_ydata(), dtype=float), [-59.0] * 2)
-    level = np.asarray(in_training["once, one iteration"].get_ydata(), dtype=float)
-    np.testing.assert_allclose(level, -39.0)  # evaluated: nothing was trained on
-    assert greedy.get_xlabel() == "environment steps"
-    assert [axes.child_axes for axes in figure.axes] == [[], [], []]
-    timed = experiment_plots.learning_curves(data, REFERENCES, "", "", period=0.05)
-    assert [len(axes.child_axes) for axes in timed.axes] == [0, 1, 1]  # the first is by iteration
+    level = np.asarray(of["once, one iteration"].get_ydata(), dtype=float)
+    np.testing.assert_allclose(level, -39.0)
+    greedy = {line.get_label(): line for line in lower[0].lines}
+    np.testing.assert_allclose(np.asarray(greedy["A"].get_ydata(), dtype=float), [-35.0, -25.0])
+    assert lower[0].get_xlabel() == "environment steps"
+    assert [len(axes.child_axes) for axes in lower] == [0, 1, 0]  # robot time
+    # columns of the same task have the same axes
+    assert upper[0].get_ylim() == upper[1].get_ylim() == lower[0].get_ylim() != upper[2].get_ylim()
+    assert [axes.get_title(loc="left") for axes in upper] == [
+        f"{title}\nwith exploration" for title in ("left", "right", "other")
+    ]
+    legends = [axes.get_legend() for axes in figure.axes[6:9]]
+    assert all(len(legend.get_texts()) == 2 for legend in legends)
     plotting.save(figure, tmp_path / "curves.png")

@@ -135,9 +135,9 @@ def test_a_result_is_stale_if_code_or_settings_differ(tmp_path: Path) -> None:
     content = json.loads((ROOT / "results/golden.json").read_text())
     curve = "swing-up: paper-like"
     content["settings"][curve] |= {"kl_bound": 0.7, "setting_of_a_later_version": 1}
-    del content["settings"]["reaching: NPALP"]
+    del content["settings"]["reaching, own start: NPALP (default)"]
     why = stale_results.reasons("golden", result(tmp_path, settings=content["settings"]))
-    assert why == ["curve reaching: NPALP", f"{curve}: kl_bound"]
+    assert why == ["curve reaching, own start: NPALP (default)", f"{curve}: kl_bound"]
 
 
 def test_every_result_has_a_command_that_renews_it() -> None:

@@ -255,7 +255,7 @@ def assert_same(learner: kreps.KREPS, other: kreps.KREPS) -> None:
     assert (a.steps, a.terminated) == (b.steps, b.terminated)
     for one, two in (
         (a.policy.states, b.policy.states),
-        (a.policy.targets, b.policy.targets),
+        (a.policy.greedy(a.policy.states), b.policy.greedy(a.policy.states)),
         (a.value.alpha, b.value.alpha),
     ):
         assert np.array_equal(one, two)

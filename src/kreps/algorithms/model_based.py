@@ -250,9 +250,18 @@ def better(
 
 
 def sparse(policy: LearntPolicy) -> SparseGP:
-    """A policy on the centres that it is evaluated with."""
+    """A policy on the centres that it is evaluated with.
+
+    Its arrays are as they are read from a file, so that it rounds alike.
+    """
     assert isinstance(policy, CostSensitiveGP | SparseGP)
-    return policy.predictor if isinstance(policy, CostSensitiveGP) else policy
+    policy = policy.predictor if isinstance(policy, CostSensitiveGP) else policy
+    return replace(
+        policy,
+        states=np.ascontiguousarray(policy.states),
+        mean_weights=np.ascontiguousarray(policy.mean_weights),
+        explained=np.ascontiguousarray(policy.explained),
+    )
 
 
 def generated_step(

@@ -121,8 +121,7 @@ def improve(comparison: ModelComparison, policy: SparseGP, steps: int) -> Sparse
         policy: from which the ascent starts.
         steps: that are tried.
     """
-    best = _in_row_order(policy)
-    env = comparison.from_starts
+    best, env = policy, comparison.from_starts
     rng = np.random.default_rng((comparison.seed, GRADIENT))
     ascent = Ascent(comparison, FixedNoise.of_policy(env, best, comparison.rollouts, rng))
     value, record, rewards = ascent.evaluate(best)
@@ -139,13 +138,3 @@ def improve(comparison: ModelComparison, policy: SparseGP, steps: int) -> Sparse
         if size < SMALLEST_STEP:
             break
     return best
-
-
-def _in_row_order(policy: SparseGP) -> SparseGP:
-    """The same policy with its arrays as they are read from a file, so that it rounds alike."""
-    return replace(
-        policy,
-        states=np.ascontiguousarray(policy.states),
-        mean_weights=np.ascontiguousarray(policy.mean_weights),
-        explained=np.ascontiguousarray(policy.explained),
-    )

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,7 +16,8 @@ from kreps.envs.image_swing_up import PIXELS
 from kreps.envs.references import REFERENCE_REWARDS
 from kreps.envs.swing_up import TIME_STEP
 from kreps.errors import StorageError
-from kreps.experiments.specs import METHODS, TASKS
+from kreps.experiments.search import tuned_options
+from kreps.experiments.specs import COLUMNS, TASKS, Curve
 from kreps.experiments.tables import markdown
 from kreps.experiments.trials import code_of, commits_of
 from kreps.learning.collect import simulate
@@ -27,6 +28,9 @@ from kreps.policies.exploration import BangBang
 from kreps.seeding import Purpose, generator, integer_seed
 from kreps.versions import versions
 
+if TYPE_CHECKING:
+    from kreps.experiments.plots import Column
+
 
 def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The rows of all trials: one per method, seed and iteration."""
@@ -34,8 +38,9 @@ def rows_of(results: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
 
 
 def named_rows(rows: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """The rows with ``method`` followed by the task, if the rows are of several tasks."""
-    if len({row["task"] for row in rows}) == 1:
+    """The rows with ``method`` followed by the task, if there are several tasks of a method."""
+    pairs = {(row["method"], row["task"]) for row in rows}
+    if len(pairs) == len({method for method, _ in pairs}):
         return [{**row} for row in rows]
     return [{**row, "method": f"{row['method']}, {row['task']}"} for row in rows]
 
@@ -251,25 +256,55 @@ def write_figure(
     from kreps.experiments import plots
 
     write_results(folder, name, command, results)
-    rows = named_rows(rows_of(results))
     if name in STEP_BY_STEP:  # from the rounded numbers of the file, so that it can be repeated
         with open(folder / f"{name}.csv", newline="") as file:
             table = steps_table(named_rows(list(csv.DictReader(file))))
         write_atomically(folder / f"{name}-steps.md", (table + "\n").encode())
-    references = {
-        row["method"]: REFERENCE_REWARDS.get(TASKS[row["task"]].environment, {}) for row in rows
-    }
-    periods = {period_of(row["task"]) for row in rows}
-    period = periods.pop() if len(periods) == 1 else None
     source = f"{command}   (commit {commits_of(results)})"
     if name in SEED_BY_SEED:
+        rows = named_rows(rows_of(results))
+        references = {row["method"]: _references(row["task"]) for row in rows}
+        period = _common_period([row["task"] for row in rows])
         figure = plots.comparison(rows, references, TITLES[name], source, period)
     else:
-        of_first = next(iter(references.values()))
-        known = list(METHODS) if rows[0]["method"] in METHODS else []
-        figure = plots.learning_curves(rows, of_first, TITLES[name], source, known, period)
+        figure = plots.learning_curves(columns_of(name, results), TITLES[name], source)
     picture = plotting.save(figure, folder / f"{name}.png")
     return [folder / f"{name}.{ending}" for ending in ("csv", "json", "md")] + [picture]
+
+
+def _references(task: str) -> Mapping[str, float]:
+    return REFERENCE_REWARDS.get(TASKS[task].environment, {})
+
+
+def _common_period(tasks: Sequence[str]) -> float | None:
+    periods = {period_of(task) for task in tasks}
+    return periods.pop() if len(periods) == 1 else None
+
+
+def columns_of(name: str, results: Sequence[Mapping[str, Any]]) -> list[Column]:
+    """What each column of a figure shows; a figure that is not of the paper has one column.
+
+    The name of a curve ends with the options that the search has chosen.
+    """
+    from kreps.experiments.plots import Column  # Matplotlib is slow to import
+
+    names: dict[Curve, str] = {}
+    rows_of_curve: dict[Curve, list[Mapping[str, Any]]] = {}
+    rows = rows_of(results)
+    for row, named in zip(rows, named_rows(rows), strict=True):
+        curve = row["task"], row["method"]
+        chosen = ", ".join(f"{k}={v!r}" for k, v in tuned_options(*curve).items())
+        names[curve] = f"{named['method']}{': ' if chosen else ''}{chosen}"
+        rows_of_curve.setdefault(curve, []).append(row)
+    columns = []
+    for title, shown in COLUMNS.get(name, {"": tuple(names)}).items():
+        curves = [curve for curve in shown if curve in names]
+        if curves:
+            tasks = [task for task, _ in curves]
+            by_name = {names[curve]: rows_of_curve[curve] for curve in curves}
+            references = _references(tasks[0])
+            columns.append(Column(title, tasks[0], by_name, references, _common_period(tasks)))
+    return columns
 
 
 def draw_features(path: Path) -> Path:

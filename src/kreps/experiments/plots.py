@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -92,97 +95,106 @@ def _draw_seeds(axes: Axes, rows: Sequence[Mapping[str, Any]], name: str) -> Non
     axes.legend(loc="lower right", frameon=True, framealpha=1.0, edgecolor="none")  # above lines
 
 
-PANELS = (
-    ("training_reward", "iteration", "As in the paper: training rollouts"),
-    ("stochastic", "steps", "Evaluated, with exploration"),
-    ("greedy", "steps", "Evaluated, without exploration"),
-)
-"""Column, horizontal axis and title of each panel."""
+ROWS = {"stochastic": "with exploration", "greedy": "without exploration"}
+"""What the rows of learning curves show: column of the results, and its title."""
+
+LEGEND_WIDTH = 52
+"""Characters of a line of a legend."""
 
 
-def learning_curves(
-    rows: Sequence[Mapping[str, Any]],
-    references: Mapping[str, float],
-    title: str,
-    source: str,
-    known: Sequence[str] = (),
-    period: float | None = None,
-) -> Figure:
-    """Mean and twice the standard error of each method, by iteration and by environment steps.
+@dataclass(frozen=True)
+class Column:
+    """Learning curves in the same axes; the n-th one has the same colour in each column.
 
-    A method with a single iteration is drawn as a horizontal line, in the first panel at its
-    evaluated reward.
+    Attributes:
+        title: above them.
+        task: columns of the same task share their axes.
+        curves: by their names in the legend, the rows of a curve: one per seed and iteration.
+        references: values to draw as lines, by name.
+        period: seconds per environment step, if all curves have the same.
+    """
+
+    title: str
+    task: str
+    curves: Mapping[str, Sequence[Mapping[str, Any]]]
+    references: Mapping[str, float]
+    period: float | None = None
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        """Smallest and largest reward to show: without the lowest hundredth."""
+        shown = [row[name] for rows in self.curves.values() for row in rows for name in ROWS]
+        values = [*self.references.values(), *np.quantile(shown, (0.01, 1.0))]
+        return float(min(values)), float(max(values))
+
+
+def learning_curves(columns: Sequence[Column], title: str, source: str) -> Figure:
+    """Mean and twice the standard error of each curve by environment steps.
+
+    The evaluated reward is above with exploration, and below without.  A curve with a single
+    iteration is drawn as a horizontal line.
 
     Args:
-        rows: of a figure, one per method, seed and iteration.
-        references: values to draw as lines, by name.
+        columns: from left to right; each has a legend below.
         title: of the figure.
         source: command and commit, printed below.
-        known: methods with the same colour in all figures.
-        period: seconds per environment step, if all methods have the same.
     """
-    methods = list(dict.fromkeys(row["method"] for row in rows))
-    index = {name: i for i, name in enumerate(dict.fromkeys([*known, *methods]))}
+    names = max(len(column.curves) for column in columns)
     with rc_context(STYLE):
-        figure = Figure(figsize=(13.0, 5.0))
-        plots = figure.subplots(1, len(PANELS), sharey=True)
-        for method in methods:
-            colour = COLOURS[index[method] % len(COLOURS)]
-            line = LINES[index[method] % len(LINES)]
-            mine = [row for row in rows if row["method"] == method]
-            for axes, (value, by, _) in zip(plots, PANELS, strict=True):
-                _draw_mean(axes, mine, value, by, method, color=colour, ls=line)
-        shown = [row[name] for row in rows for name in ("stochastic", "greedy")]
-        low, high = min([*references.values(), *_quantiles(shown)]), max(references.values())
-        for axes, (_, by, heading) in zip(plots, PANELS, strict=True):
-            axes.set_title(heading)
-            axes.set_xlabel("iteration" if by == "iteration" else "environment steps")
-            add_robot_time(axes, None if by == "iteration" else period)
-            axes.xaxis.set_major_locator(MaxNLocator(7, integer=True))
-            axes.set_ylim(low - 0.06 * (high - low), high + 0.10 * (high - low))
-            draw_references(axes, references, named=axes is plots[-1])
-        plots[0].set_ylabel("average reward per step")
-        handles, labels = plots[0].get_legend_handles_labels()
-        legend = figure.legend(
-            handles, labels, loc="outside upper left", ncols=3, title=title, alignment="left"
+        figure = Figure(figsize=(3.9 * len(columns) + 1.4, 7.2 + 0.24 * names))
+        plots = figure.subplots(
+            3, len(columns), squeeze=False, height_ratios=(3.4, 3.4, 0.4 + 0.24 * names)
         )
-        legend.get_title().set_fontweight("bold")
+        first = {column.task: plots[0, i] for i, column in reversed(list(enumerate(columns)))}
+        for column, (*pair, below) in zip(columns, plots.T, strict=True):
+            for axes, (value, heading) in zip(pair, ROWS.items(), strict=True):
+                if axes is not first[column.task]:
+                    axes.sharex(first[column.task])
+                    axes.sharey(first[column.task])
+                for colour, line, (name, rows) in zip(
+                    cycle(COLOURS), cycle(LINES), column.curves.items(), strict=False
+                ):
+                    _draw_mean(axes, rows, value, name, color=colour, ls=line)
+                draw_references(axes, column.references, named=column is columns[-1])
+                axes.set_title(f"{column.title}{chr(10) if column.title else ''}{heading}")
+                axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+            pair[1].set_xlabel("environment steps")
+            add_robot_time(pair[1], column.period)
+            below.set_axis_off()
+            below.legend(*pair[0].get_legend_handles_labels(), loc="upper left", fontsize=8)
+        for task, axes in first.items():
+            limits = np.array([column.limits for column in columns if column.task == task])
+            low, high = limits[:, 0].min(), limits[:, 1].max()
+            axes.set_ylim(low - 0.06 * (high - low), high + 0.10 * (high - low))
+        for axes in plots[:2, 0]:
+            axes.set_ylabel("average reward per step")
+        figure.suptitle(title, fontweight="bold")
         figure.supxlabel(source, fontsize=6.5, color=GREY)
     return figure
 
 
-def _quantiles(values: Sequence[float]) -> list[float]:
-    return [float(q) for q in np.quantile(values, (0.01, 0.99))]
-
-
 def _draw_mean(
-    axes: Axes,
-    rows: Sequence[Mapping[str, Any]],
-    value: str,
-    by: str,
-    name: str,
-    **look: Any,
+    axes: Axes, rows: Sequence[Mapping[str, Any]], value: str, name: str, **look: Any
 ) -> None:
     """One curve with its band; a horizontal line if there is a single iteration."""
     iterations = sorted({row["iteration"] for row in rows})
-    once = len(iterations) == 1
-    if once and value == "training_reward":
-        value = "stochastic"  # its training data is not from a policy
-    columns = [[row for row in rows if row["iteration"] == i] for i in iterations]
-    x = np.array([np.mean([row[by] for row in column]) for column in columns])
-    mean = np.array([np.mean([row[value] for row in column]) for column in columns])
-    error = np.array(
-        [
-            2 * np.std([row[value] for row in c], ddof=1) / np.sqrt(len(c)) if len(c) > 1 else 0.0
-            for c in columns
-        ]
+    steps, mean, error = np.transpose(
+        [_moments([row for row in rows if row["iteration"] == i], value) for i in iterations]
     )
-    if once:
-        axes.axhline(mean[0], label=f"{name}, one iteration", lw=1.6, **look)
-        axes.axhspan(mean[0] - error[0], mean[0] + error[0], color=look["color"], alpha=0.15, lw=0)
+    band = {"color": look["color"], "alpha": 0.18, "lw": 0}
+    if len(iterations) == 1:
+        axes.axhline(mean[0], label=fill(f"{name}, one iteration", LEGEND_WIDTH), lw=1.6, **look)
+        axes.axhspan(mean[0] - error[0], mean[0] + error[0], **band)
         return
-    axes.plot(x, mean, label=name, lw=1.6, **look)
-    axes.fill_between(x, mean - error, mean + error, color=look["color"], alpha=0.18, lw=0)
+    axes.plot(steps, mean, label=fill(name, LEGEND_WIDTH), lw=1.6, **look)
+    axes.fill_between(steps, mean - error, mean + error, **band)
+
+
+def _moments(rows: Sequence[Mapping[str, Any]], value: str) -> tuple[float, float, float]:
+    """Mean steps, mean value and twice its standard error, over seeds."""
+    values = np.array([row[value] for row in rows])
+    error = 2.0 * values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+    return float(np.mean([row["steps"] for row in rows])), float(values.mean()), float(error)
 
 
 def image_features(observations: FloatArray, times: Sequence[float], pixels: int) -> Figure:

@@ -1,10 +1,12 @@
 """The parameter search of the compared methods, on seeds that no figure uses.
 
 Each method has the same number of candidates on each task.  The first candidate is the method's
-defaults, except where these need a grid that is too large for the task.  All candidates learn on
-the same seeds.  The score is the evaluated reward of the policy, half with its exploration and half
-without, averaged over the last updates and the seeds.  With exploration alone the search would
-choose value iteration with little exploration, whose greedy policy is far from its best.
+preset, except where this needs a grid that is too large for the task.  With the preset ``authors``
+the candidates are values that their scripts try, so REPS, for which these name one value, is not
+searched; nor is the default of this library.  All candidates learn on the same seeds.  The score is
+the evaluated reward of the policy, half with its exploration and half without, averaged over the
+last updates and the seeds.  With exploration alone the search would choose value iteration with
+little exploration, whose greedy policy is far from its best.
 """
 
 from __future__ import annotations
@@ -19,12 +21,20 @@ from typing import Any
 import numpy as np
 
 from kreps.errors import StorageError
-from kreps.experiments.specs import FEATURES, GRID_VI, KERNEL, METHODS, NPALP, SAMPLE, VALUES
+from kreps.experiments.specs import (
+    FEATURES,
+    GRID_VI,
+    KERNEL,
+    NPALP,
+    SAMPLE,
+    VALUES,
+    with_preset,
+)
 from kreps.experiments.tables import markdown
 from kreps.experiments.trials import Trial, code_of, commits_of, name_of, trial_of
 from kreps.learning.storage import write_atomically
 
-SEEDS = (200, 201)
+SEEDS = (200, 201, 202)
 ITERATIONS = 10
 COUNTED = 5
 """The score averages over so many of the latest updates."""
@@ -32,60 +42,82 @@ COUNTED = 5
 EPISODES = 20
 """Rollouts of each evaluation."""
 
-_REPS: tuple[dict[str, Any], ...] = (
+Candidates = tuple[dict[str, Any], ...]
+
+
+def _each(shared: Mapping[str, Any], *candidates: Mapping[str, Any]) -> Candidates:
+    return tuple({**shared, **candidate} for candidate in candidates)
+
+
+def _grids(*sizes: tuple[Any, int], **shared: Any) -> Candidates:
+    return _each(shared, *({"grid_states": s, "grid_actions": a} for s, a in sizes))
+
+
+# What the paper leaves open: bound, ridge and temperature floor.
+_PAPER: Candidates = ({}, {"kl_bound": 1.0}, {"ridge": 0.01}, {"eta_floor": 0.1})
+_PAPER_FEATURES: Candidates = ({}, {"value.size": 20}, {"ridge": 0.01}, {"eta_floor": 0.1})
+_DEFAULT_SAMPLE: Candidates = ({}, {"kl_bound": 0.5}, {"ridge": 0.01}, {"eta_floor": 0.1})
+_DEFAULT_FEATURES: Candidates = ({}, {"value.size": 20}, {"kl_bound": 0.5}, {"ridge": 0.1})
+_TEMPERATURES: Candidates = (
     {},
-    {"preset": "paper"},
-    {"kl_bound": 0.7},
-    {"ridge": 0.03},
-    {"kl_bound": 0.7, "ridge": 0.03},
-    {"kl_bound": 0.5, "ridge": 0.01, "eta_floor": 0.02},
-)
-_VALUE_ITERATION: tuple[dict[str, Any], ...] = (
-    {},
-    {"temperature": 0.3},
     {"temperature": 0.1},
+    {"temperature": 0.3},
     {"temperature": 3.0},
-    {"temperature": 0.3, "actions": 9},
-    {"temperature": 0.1, "actions": 9},
+)
+# Inverse temperatures of 3 (the preset), 1.5 and 1, and that of their grid, 20.
+_AUTHORS_TEMPERATURES: Candidates = (
+    {},
+    {"temperature": 0.667},
+    {"temperature": 1.0},
+    {"temperature": 0.05},
 )
 
-
-def _grids(*sizes: tuple[int, int]) -> tuple[dict[str, Any], ...]:
-    return tuple({"grid_states": states, "grid_actions": actions} for states, actions in sizes)
-
-
-CANDIDATES: dict[str, dict[str, tuple[dict[str, Any], ...]]] = {
-    "reaching": {
-        KERNEL: _REPS,
-        SAMPLE: _REPS,
-        VALUES: _VALUE_ITERATION,
-        GRID_VI: _grids((4, 3), (3, 3), (3, 5), (3, 7), (4, 4), (5, 3)),
-        NPALP: (
+CANDIDATES: dict[str, dict[str, Candidates]] = {
+    "authors-reaching": {
+        with_preset(VALUES, "authors"): _each({"actions": 100}, *_AUTHORS_TEMPERATURES),
+        with_preset(GRID_VI, "authors"): _grids((5, 2), (4, 2), (3, 3), (4, 3), actions=100),
+        with_preset(NPALP, "authors"): (
             {},
-            {"lipschitz": 3.0},
+            {"noise_scale": 0.2},
+            {"noise_fraction": 0.03, "noise_scale": 0.4},
+            {"noise_fraction": 0.01},
+        ),
+    },
+    "authors-swing-up": {
+        with_preset(VALUES, "authors"): _AUTHORS_TEMPERATURES,
+        with_preset(GRID_VI, "authors"): (
+            {},
+            {"temperature": 0.333},
+            {"grid_states": [25, 17], "grid_actions": 13},
+            {"grid_states": [25, 17], "grid_actions": 13, "temperature": 0.333},
+        ),
+    },
+    "reaching": {
+        with_preset(KERNEL, "paper"): _PAPER,
+        with_preset(SAMPLE, "paper"): _PAPER,
+        with_preset(SAMPLE, "default"): _DEFAULT_SAMPLE,
+        with_preset(VALUES, "default"): _TEMPERATURES,
+        with_preset(GRID_VI, "default"): _grids((4, 3), (3, 3), (3, 5), (5, 3)),
+        with_preset(NPALP, "default"): (
+            {},
             {"lipschitz": 30.0},
-            {"lipschitz": 100.0},
             {"lipschitz": 30.0, "noise_scale": 0.1},
             {"lipschitz": 30.0, "noise_scale": 0.1, "noise_fraction": 1.0},
         ),
     },
     "swing-up": {
-        KERNEL: _REPS,
-        SAMPLE: _REPS,
-        FEATURES: (
-            {},
-            {"preset": "paper"},
-            {"value.size": 20},
-            {"ridge": 0.03},
-            {"value.size": 7},
-            {"value.size": 15},
-        ),
-        VALUES: _VALUE_ITERATION,
-        GRID_VI: _grids((15, 7), (10, 7), (20, 5), (25, 5), (20, 9), (30, 3)),
+        with_preset(KERNEL, "paper"): _PAPER,
+        with_preset(SAMPLE, "paper"): _PAPER,
+        with_preset(FEATURES, "paper"): _PAPER_FEATURES,
+        with_preset(SAMPLE, "default"): _DEFAULT_SAMPLE,
+        with_preset(FEATURES, "default"): _DEFAULT_FEATURES,
+        with_preset(VALUES, "default"): _TEMPERATURES,
+        with_preset(GRID_VI, "default"): _grids((15, 7), (10, 7), (20, 5), (25, 5)),
     },
     "images": {
-        KERNEL: _REPS,
-        SAMPLE: _REPS,
+        with_preset(KERNEL, "paper"): _PAPER,
+        with_preset(SAMPLE, "paper"): _PAPER,
+        with_preset(SAMPLE, "default"): _DEFAULT_SAMPLE,
     },
 }
 
@@ -191,11 +223,13 @@ def search_table(content: Mapping[str, Any]) -> str:
 
 
 def tuned_options(task: str, method: str) -> dict[str, Any]:
-    """The options of the best candidate, from the committed outcome; none if not `tuned`."""
-    if not METHODS[method].tuned:
-        return {}
-    chosen = _committed_outcome()[task][method]["chosen"]
-    return dict(chosen)
+    """The options of the best candidate, from the committed outcome; none if there is no search.
+
+    Those of the first candidate where there is no outcome of the search yet.
+    """
+    candidates = CANDIDATES.get(task, {}).get(method, ({},))
+    found = _committed_outcome().get(task, {}).get(method, {"chosen": candidates[0]})
+    return dict(found["chosen"])
 
 
 @cache

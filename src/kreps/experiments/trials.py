@@ -109,7 +109,7 @@ def trial_of(
         method=method_name,
         environment=task.environment,
         learner=method.learner,
-        options={**protocol, **method.options, **options},
+        options={**protocol, **task.options, **method.options, **options},
         iterations=1 if method.once else wanted,
         seed=seed,
         episodes=episodes,

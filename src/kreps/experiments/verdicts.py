@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from kreps.errors import StorageError
-from kreps.experiments.claims import CLAIMS, EARLY, LATE, MARGINS, Claim, Kind, Rows
+from kreps.experiments.claims import CLAIMS, EARLY, LATE, Claim, Kind, Rows
 from kreps.experiments.figures import named_rows
 from kreps.experiments.statistics import (
     QUARTER,
@@ -180,7 +180,7 @@ def assess(comparisons: Sequence[Comparison]) -> list[dict[str, Any]]:
     tested = [each for each in comparisons if each.samples]
     effects = [each.effect() for each in tested]
     p_values = [
-        p_value(effect, each.claim.kind, MARGINS[each.claim.figure])
+        p_value(effect, each.claim.kind, each.claim.margin)
         for effect, each in zip(effects, tested, strict=True)
     ]
     found = {
@@ -204,11 +204,12 @@ def _description(each: Comparison) -> dict[str, Any]:
     return {
         "claim": claim.text,
         "figure": claim.figure,
+        "column": claim.column,
         "comparison": claim.better if claim.worse is None else f"{claim.better} - {claim.worse}",
         "measure": claim.measure.__name__.replace("_", " "),
         "iterations": each.iterations,
         "kind": claim.kind.value,
-        "margin": MARGINS[claim.figure],
+        "margin": claim.margin,
         "seeds": list(each.seeds),
         "paired": each.paired,
     }
@@ -219,7 +220,7 @@ def _numbers(
 ) -> dict[str, Any]:
     low, high = effect.interval(level)
     mean = each.effect(trimmed=0.0)
-    kind, margin = each.claim.kind, MARGINS[each.claim.figure]
+    kind, margin = each.claim.kind, each.claim.margin
     return {
         "effect": round(effect.estimate, 4),
         "low": round(low, 4),
