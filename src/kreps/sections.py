@@ -124,8 +124,9 @@ class ModelBased(Checked):
         improvement_steps: largest number of further steps in states that model rollouts of the
             newest policy visit.  They end after three in a row without a gain in the model, and
             the best policy is kept.  There are none without an acceptance test.
-        random_policies: number of random linear policies of an update whose best one is kept if its
-            return in the model is larger; 0 for none.  There are none without an acceptance test.
+        random_policies: number of random linear policies of an update, the best of which explores
+            if its return in the model, with the bonus, is larger than that of the policy optimised
+            with it; 0 for none.  There are none without an acceptance test.
         gradient_steps: largest number of steps by the gradient of the return in model rollouts,
             from the best policy on; 0 for none.  There are none without an acceptance test.
         max_samples: largest number of generated actions of an update.

@@ -3,13 +3,14 @@
 This is the idea of Dyna (Sutton 1990).  In a first step states are resampled by the weights of
 Algorithm 1, in the others they are visited in model rollouts of the policy of the step before.  In
 each state several actions are sampled around the policy's, and weighted by the same dual.  These
-steps go on while the model predicts a larger return, and the best policy is kept, or a random one
-that is better.  Steps by the gradient of that return follow on it.  It acts only if it passes an
-acceptance test against the previous one.
+steps go on while the model predicts a larger return, and the best policy is kept.  Steps by the
+gradient of that return follow on it.  It acts only if it passes an acceptance test against the
+previous one.
 
-While there is an exploration bonus, an explorer is optimised with it by bounded steps.  It collects
-half of the next rollouts, and is neither tested nor reported: the acting policy is the best known,
-and a task that needs no exploration loses nothing but these rollouts.
+While there is an exploration bonus, an explorer is optimised with it by bounded steps; a random
+policy takes its place if it is better.  It collects half of the next rollouts, and is neither
+tested nor reported: the acting policy is the best known, and a task that needs no exploration loses
+nothing but these rollouts.
 """
 
 from __future__ import annotations
@@ -135,7 +136,6 @@ def model_based_step(
     comparison = compare_in_model(world, model_based.acceptance_rollouts, seed)
     best, returns = optimise(batch, world, step, comparison, rng)
     if comparison is not None and returns is not None:
-        best, returns = or_random(batch, best, returns, comparison, rng)
         best, returns = or_ascended(batch, best, returns, comparison)
     rejected = None
     if comparison is not None and returns is not None and state.policy is not None:

@@ -1,7 +1,8 @@
-"""Random policies as further starts of the policy search, which the paper has not.
+"""Random policies as candidates for the explorer, which the paper has not.
 
-Bounded steps and gradients improve a policy by small changes, so they end in a local optimum of the
-return in the model.  A good random policy can lie outside of its basin.  Linear policies of the
+Bounded steps improve a policy by small changes, so they end in a local optimum of the return in the
+model, also of that with the exploration bonus.  A good random policy can lie outside of its basin.
+Linear policies of the
 state whose actions are mostly at their limits are few enough to be tried by random, and solve many
 control tasks roughly (H. Mania et al., NeurIPS 2018, search among them alone): on a pendulum about
 half of them pump energy into the swing.
