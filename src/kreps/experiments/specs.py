@@ -240,7 +240,7 @@ EXTRA_EXPERIMENTS: dict[str, tuple[Curve, ...]] = {
 }
 """Experiments that the paper does not have: run by name, not by ``all``."""
 
-FIRST_SEED = {"untuned": 1220, "ablation": 1220}
+FIRST_SEED = {"untuned": 1240, "ablation": 1220}
 """First seed of experiments that use fresh seeds, unseen during development; 0 elsewhere."""
 
 PICTURES = ("figure-2a",)
