@@ -51,8 +51,7 @@ def half_squared_distance(a: FloatArray, b: FloatArray) -> float:
 # ---- the radius -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("share", [0.9, 0.5])
-def test_a_share_of_the_samples_has_one_of_another_rollout_within_the_radius(share: float) -> None:
+def test_most_samples_have_one_of_another_rollout_within_the_radius() -> None:
     made = rollouts(6)
     nearest = [
         min(half_squared_distance(s, t) for o in made if o is not r for t in o.observations[:-1])
@@ -60,18 +59,16 @@ def test_a_share_of_the_samples_has_one_of_another_rollout_within_the_radius(sha
         for s in r.observations[:-1]
     ]
     env = model_env(made)
-    found = novelty_radius(env, share=share)
+    found = novelty_radius(env)
     assert found is not None and found < LIMIT
     similarity = np.exp(-np.array(nearest))
-    assert found == pytest.approx(-np.log(np.quantile(similarity, 1.0 - share)), rel=1e-9)
-    assert np.mean(np.array(nearest) <= found) == pytest.approx(share, abs=0.03)
-    if share == 0.9:
-        assert found == novelty_radius(env)  # the default
+    assert found == pytest.approx(-np.log(np.quantile(similarity, 0.1)), rel=1e-9)
+    assert np.mean(np.array(nearest) <= found) == pytest.approx(0.9, abs=0.03)
 
 
 def test_the_radius_has_an_upper_limit_per_factor_of_the_kernel() -> None:
     made = rollouts(6, spread=2.0)
-    assert novelty_radius(model_env(made)) == novelty_radius(model_env(made), 0.5) == LIMIT
+    assert novelty_radius(model_env(made)) == LIMIT
     # one factor for both coordinates, and a factor for each of three
     env: Any = SimpleNamespace(
         data=model_env(made).data, kernel=Kernel((SquaredExponential((0, 1)),), np.array([0.1]))

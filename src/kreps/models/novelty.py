@@ -124,17 +124,13 @@ def novelty_bonus(
     return NoveltyBonus(average + strength * max(best - average, 0.0), average, radius)
 
 
-def novelty_radius(
-    model_env: ModelEnv, share: float = KNOWN_SHARE, block_size: int = BLOCK_SIZE
-) -> float | None:
+def novelty_radius(model_env: ModelEnv, block_size: int = BLOCK_SIZE) -> float | None:
     """Half the squared distance, in lengthscales, within which most samples have another rollout's.
 
     Samples of the same rollout do not count, as they are near in any case.
 
     Args:
         model_env: of the samples.
-        share: of the samples that have a sample of another rollout within the radius, unless it
-            is limited by `MAX_RADIUS`.
         block_size: samples compared with all others at once.
 
     Returns:
@@ -148,6 +144,6 @@ def novelty_radius(
         similarity = model_env.kernel.gram(states[i : i + block_size], states)
         similarity[rollout[i : i + block_size, None] == rollout] = 0.0
         nearest.append(similarity.max(axis=1))
-    at_radius = np.quantile(np.concatenate(nearest), 1.0 - share)
+    at_radius = np.quantile(np.concatenate(nearest), 1.0 - KNOWN_SHARE)
     largest = MAX_RADIUS * len(model_env.kernel.lengthscales)
     return min(max(-float(np.log(max(at_radius, _TINY))), MIN_RADIUS), largest)
