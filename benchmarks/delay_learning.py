@@ -1,12 +1,12 @@
 """Learning with delays and hidden state: writes ``results/delay-learning.json`` and ``.md``.
 
-    python benchmarks/delay_learning.py --seeds 1240 1241 --workers 2
+    python benchmarks/delay_learning.py --seeds 1250 1251 --workers 2
 
 The swing-up with each perturbation is learnt by `KREPS(env)` in three ways: with
 ``history="auto"``, from the last observation alone, and, as a reference, with the full hidden state
 in the observation (the waiting actions, the velocity, the state of the actuator).  The score is the
 average reward per step of the greedy policy at p = 0.02, as in all results.  Runs of the same
-commit that the file already has are not made again.
+code that the file already has are not made again.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from matplotlib.figure import Figure
 import kreps
 from kreps import plotting
 from kreps.envs.perturb import Backlash, DeadZone, Delay, Hidden, Lag, Perturbed
+from kreps.envs.swing_up import TIME_STEP
 from kreps.experiments.fingerprint import script_fingerprint
 from kreps.experiments.provenance import commit
 from kreps.experiments.tables import markdown
@@ -38,13 +39,10 @@ from kreps.learning.evaluate import Greedy, evaluate
 
 RESULTS = Path(__file__).parents[1] / "results"
 STEPS = 4_000
-"""Environment steps after which a policy is evaluated."""
+"""The policy of the update nearest to so many environment steps is evaluated."""
 
 EPISODES = 50
 """Rollouts of each evaluation, of 400 steps."""
-
-PERIOD = 0.05
-"""Control period of the swing-up, in s."""
 
 DELAYS = {f"action delay of {k}": {"actions": (Delay(k),)} for k in (1, 2, 3)}
 PERTURBATIONS: dict[str, dict[str, Any]] = {
@@ -54,7 +52,7 @@ PERTURBATIONS: dict[str, dict[str, Any]] = {
     "angle alone": {"observations": (Hidden(1),)},
     "backlash of 0.1 rad": {"observations": (Backlash((0.1, 0.0)),)},
     "dead zone of 5 N m": {"actions": (DeadZone(5.0),)},
-    "actuator lag of 50 ms": {"actions": (Lag(0.05 / PERIOD),)},
+    "actuator lag of 50 ms": {"actions": (Lag(0.05 / TIME_STEP),)},
 }
 AUTO, LAST, FULL = 'history="auto"', "last observation", "full state"
 WAYS: dict[str, tuple[bool, dict[str, Any]]] = {
@@ -102,27 +100,27 @@ def run(perturbation: str, way: str, seed: int) -> dict[str, Any]:
     }
 
 
-def means(runs: list[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
+def grouped(runs: list[dict[str, Any]]) -> dict[tuple[str, str], list[dict[str, Any]]]:
     """The runs of each perturbation and way."""
-    grouped: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
+    found: dict[tuple[str, str], list[dict[str, Any]]] = defaultdict(list)
     for each in runs:
-        grouped[each["perturbation"], each["way"]].append(each)
-    return grouped
+        found[each["perturbation"], each["way"]].append(each)
+    return found
 
 
 def table(runs: list[dict[str, Any]]) -> str:
     """Mean and worst seed of each way, and what ``"auto"`` chose."""
-    grouped, rows = means(runs), []
+    by_way, rows = grouped(runs), []
     for perturbation in PERTURBATIONS:
         row = [perturbation]
         for way in WAYS:
-            found = [each["greedy"] for each in grouped[perturbation, way]]
+            found = [each["greedy"] for each in by_way[perturbation, way]]
             row.append(f"{np.mean(found):.1f} ({min(found):.1f})" if found else "–")
-        auto = grouped[perturbation, AUTO]
+        auto = by_way[perturbation, AUTO]
         row.append(", ".join(f"({each['delay']}, {each['history']})" for each in auto))
         seconds = [
             sum(each["cpu_seconds"] for each in some) / max(sum(e["updates"] for e in some), 1)
-            for some in (auto, grouped[perturbation, LAST])
+            for some in (auto, by_way[perturbation, LAST])
         ]
         row.append(" / ".join(f"{each:.1f}" for each in seconds))
         rows.append(row)
@@ -133,14 +131,14 @@ def table(runs: list[dict[str, Any]]) -> str:
 
 def draw(runs: list[dict[str, Any]]) -> Figure:
     """Reward against the delay in s: every seed, and the mean of each way."""
-    grouped = means(runs)
+    by_way = grouped(runs)
     names = ["none", *DELAYS]
     with rc_context(plotting.STYLE):
         figure = Figure(figsize=(5.5, 3.2))
         axes = figure.subplots()
         for way in WAYS:
-            found = [[each["greedy"] for each in grouped[name, way]] for name in names]
-            delays = PERIOD * np.arange(len(names))
+            found = [[each["greedy"] for each in by_way[name, way]] for name in names]
+            delays = TIME_STEP * np.arange(len(names))
             (line,) = axes.plot(delays, [np.mean(each) for each in found], label=way)
             for delay, values in zip(delays, found, strict=True):
                 axes.plot([delay] * len(values), values, ".", color=line.get_color())
@@ -156,12 +154,12 @@ def draw(runs: list[dict[str, Any]]) -> Figure:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1240, 1241])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1250, 1251])
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
     path, code = RESULTS / "delay-learning.json", script_fingerprint(Path(__file__))
     stored = json.loads(path.read_text()) if path.exists() else {}
-    runs = stored["runs"] if stored.get("commit") == commit() else []
+    runs = stored["runs"] if stored.get("code") == code else []
     done = {(each["perturbation"], each["way"], each["seed"]) for each in runs}
     missing = [
         key

@@ -4,7 +4,7 @@
     python benchmarks/suite.py --seeds 20 21 22 --workers 2
 
 `KREPS(env)` alone, without any setting.  The score is what users of these tasks quote: the
-undiscounted return of the greedy policy over whole episodes.  Runs of the same commit that the file
+undiscounted return of the greedy policy over whole episodes.  Runs of the same code that the file
 already has are not made again.
 """
 
@@ -181,7 +181,7 @@ def main() -> None:
     results, file = [], RESULTS / "suite.json"
     if file.exists():
         before = json.loads(file.read_text())
-        results = before["results"] if before["commit"] == commit() else []
+        results = before["results"] if before["code"] == script_fingerprint(Path(__file__)) else []
     done = {(run["task"], run["seed"]) for run in results}
     jobs = [(task, seed) for seed in args.seeds for task in args.tasks if (task, seed) not in done]
     with ProcessPoolExecutor(args.workers) as pool:

@@ -119,6 +119,18 @@ def test_derivatives_are_those_of_the_predictions() -> None:
         np.testing.assert_allclose(slopes[:, :, j], change / (2.0 * step), atol=1e-5)
 
 
+def test_the_narrowest_kernels_are_not_larger_than_one() -> None:
+    """Where rounding leaves nothing of the distances, an exponent could be any number."""
+    regression, _, inputs = fitted(smooth_and_noise(samples()))
+    narrow = tuple(
+        replace(part, kernel=part.kernel.with_lengthscales(1e-9 * part.kernel.lengthscales))
+        for part in regression.parts
+    )
+    found = replace(regression, parts=narrow)(inputs + 1e-3)
+    for columns, part in zip(regression.columns, narrow, strict=True):
+        assert np.abs(found[:, columns]).max() <= np.abs(part.alpha).sum()
+
+
 def test_narrow_kernels_predict_the_same() -> None:
     """Kernel values too small for a normal number are raised to ones without an effect."""
     regression, _, inputs = fitted(smooth_and_noise(samples()))

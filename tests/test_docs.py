@@ -121,7 +121,7 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
 
 def test_claims_are_those_of_the_result_files(tmp_path: Path) -> None:
     if "claims" in json.loads((ROOT / "results/stale.json").read_text()):
-        return  # they may be about other curves
+        pytest.skip("the claims are declared stale: they may be about other curves")
     for path in (ROOT / "results").glob("figure-*.csv"):
         (tmp_path / path.name).write_bytes(path.read_bytes())
     write_claims(tmp_path)

@@ -250,7 +250,7 @@ def test_the_committed_search_has_the_present_candidates() -> None:
     content = json.loads(file.read_text())
     assert search.tuned_options("swing-up", "kreps (default)") == {}
     if "search" in json.loads((ROOT / "results/stale.json").read_text()):
-        return  # it may be of other candidates
+        pytest.skip("the search is declared stale: it may be of other candidates")
     assert content["seeds"] == list(search.SEEDS)
     assert "+" not in content["commit"]
     for task, methods in search.CANDIDATES.items():

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import kreps
+from kreps.algorithms import model_based
+from kreps.algorithms.acceptance import ModelComparison
 from kreps.algorithms.exact import ExactBatch
 from kreps.algorithms.generated import StateSource
 from kreps.algorithms.low_rank import LowRankBatch
@@ -34,6 +36,7 @@ from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray
 from kreps.models.transition import state_actions, state_kernel
 from kreps.models.world_model import WorldModel
+from kreps.policies.sparse_gp import SparseGP
 from kreps.presets import settings_of
 from kreps.settings import LowRank, Settings
 
@@ -202,17 +205,20 @@ def test_the_model_rollouts_are_those_of_the_updates_process(low_rank: LowRank |
 
 
 @exact_and_low_rank
-def test_each_step_starts_from_v_of_the_step_before_and_a_temperature_of_one(
+def test_each_step_starts_from_v_of_the_step_before_and_its_temperature_if_above_one(
     low_rank: LowRank | None,
 ) -> None:
     case = Case.learnt(low_rank=low_rank)
     first = case.generated(None, StateSource.REPLAY)
     second = case.generated(first, StateSource.MODEL_ROLLOUT)
     matters = []
-    for before, found in ((case.step, first), (first, second)):
+    hot = replace(first, dual=replace(first.dual, eta=3.0))
+    third = case.generated(hot, StateSource.MODEL_ROLLOUT)
+    assert first.dual.eta < 1.0 and case.step.dual.eta < 1.0
+    for before, found in ((case.step, first), (first, second), (hot, third)):
         rewards = found.samples.problem.rewards
         problem = replace(found.samples.problem, rewards=rewards - rewards.max())
-        wanted = solve_dual(problem, start=(1.0, before.dual.theta))
+        wanted = solve_dual(problem, start=(max(1.0, before.dual.eta), before.dual.theta))
         np.testing.assert_array_equal(found.dual.weights, wanted.weights)
         assert found.dual.iterations == wanted.iterations
         cold = solve_dual(problem)
@@ -224,6 +230,33 @@ def test_each_step_starts_from_v_of_the_step_before_and_a_temperature_of_one(
         assert problem.ridge * 240 == pytest.approx(case.step.problem.ridge * 120)
         assert problem.kl_bound == case.step.problem.kl_bound
         assert problem.eta_floor == case.step.problem.eta_floor == 0.01
+
+
+@pytest.mark.parametrize("gain", [-1.0, 1.0])
+def test_a_random_policy_explores_if_it_is_better_and_never_acts(
+    gain: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    drawn: list[SparseGP] = []
+    compare = ModelComparison.returns
+
+    def draw(
+        comparison: ModelComparison, policy: SparseGP, count: int, rng: np.random.Generator
+    ) -> SparseGP:
+        assert comparison.world.bonus is not None and count == 20
+        drawn.append(replace(policy, mean_weights=-policy.mean_weights))
+        return drawn[-1]
+
+    def returns(comparison: ModelComparison, policy: Any) -> FloatArray:
+        if drawn and policy is drawn[-1]:
+            return np.full(comparison.rollouts, gain * 1e6)
+        return compare(comparison, policy)
+
+    monkeypatch.setattr(model_based, "best_random_policy", draw)
+    monkeypatch.setattr(ModelComparison, "returns", returns)
+    learner, _ = updated(turns(), **{"model_based.gradient_steps": 0})
+    assert len(drawn) == 1
+    assert (learner.state.explorer is drawn[0]) == (gain > 0.0)
+    assert learner.state.policy is not drawn[0]
 
 
 @exact_and_low_rank

@@ -28,8 +28,6 @@ TASK = TaskSpec(2, np.array([-2.0]), np.array([2.0]), periodic=(0,))
 
 STARTS = np.array([[3.0, 0.0], [-3.0, 0.5]])
 
-"""A kernel with which all states have similarity one."""
-
 
 def turns(rollouts: int = 6, steps: int = 20, seed: int = 0) -> list[Rollout]:
     """A wheel that is pushed at random from one of two states."""

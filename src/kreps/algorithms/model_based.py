@@ -132,11 +132,11 @@ def model_based_step(
     assert model_based is not None
     optimistic, reward_start = world_model(batch, step, state, rng)
     world = replace(optimistic, bonus=None)
-    seed = int(rng.integers(2**63))  # all policies of an update have the same random numbers
+    seed = int(rng.integers(2**63))  # policies are compared with the same random numbers
     comparison = compare_in_model(world, model_based.acceptance_rollouts, seed)
     best, returns = optimise(batch, world, step, comparison, rng)
     if comparison is not None and returns is not None:
-        best, returns = or_ascended(batch, best, returns, comparison)
+        best, returns = with_gradient_steps(batch, best, returns, comparison)
     rejected = None
     if comparison is not None and returns is not None and state.policy is not None:
         gain = returns - comparison.returns(state.policy)
@@ -147,7 +147,7 @@ def model_based_step(
         comparison = compare_in_model(optimistic, model_based.acceptance_rollouts, seed)
         found, returns = optimise(batch, optimistic, step, comparison, rng)
         if comparison is not None and returns is not None:
-            found, _ = or_random(batch, found, returns, comparison, rng)
+            found, _ = with_random_policies(batch, found, returns, comparison, rng)
         explorer = found.policy.policy
     step = replace(step, dual=best.dual, policy=best.policy, reward_model=world.reward_model)
     return ModelBasedResult(step, reward_start, rejected, explorer)
@@ -200,7 +200,7 @@ def optimise(
     return best, returns
 
 
-def or_random(
+def with_random_policies(
     batch: Batch[Any, Any],
     best: GeneratedStep,
     returns: FloatArray,
@@ -212,14 +212,14 @@ def or_random(
     assert model_based is not None
     if not model_based.random_policies:
         return best, returns
-    policy = sparse(best.policy.policy)
+    policy = on_its_centres(best.policy.policy)
     drawn = best_random_policy(comparison, policy, model_based.random_policies, rng)
-    found = better(best, returns, drawn, comparison)
+    found = better_of(best, returns, drawn, comparison)
     batch.clock.lap("random policies")
     return found
 
 
-def or_ascended(
+def with_gradient_steps(
     batch: Batch[Any, Any],
     best: GeneratedStep,
     returns: FloatArray,
@@ -233,13 +233,13 @@ def or_ascended(
     assert model_based is not None
     if not model_based.gradient_steps:
         return best, returns
-    improved = improve(comparison, sparse(best.policy.policy), model_based.gradient_steps)
-    found = better(best, returns, improved, comparison)
+    improved = improve(comparison, on_its_centres(best.policy.policy), model_based.gradient_steps)
+    found = better_of(best, returns, improved, comparison)
     batch.clock.lap("policy gradient")
     return found
 
 
-def better(
+def better_of(
     best: GeneratedStep, returns: FloatArray, policy: SparseGP, comparison: ModelComparison
 ) -> tuple[GeneratedStep, FloatArray]:
     """A step with its returns (rollouts,), or with another policy if this has a larger mean."""
@@ -249,7 +249,7 @@ def better(
     return replace(best, policy=replace(best.policy, policy=policy)), new_returns
 
 
-def sparse(policy: LearntPolicy) -> SparseGP:
+def on_its_centres(policy: LearntPolicy) -> SparseGP:
     """A policy on the centres that it is evaluated with.
 
     Its arrays are as they are read from a file, so that it rounds alike.

@@ -2,10 +2,9 @@
 
 Bounded steps improve a policy by small changes, so they end in a local optimum of the return in the
 model, also of that with the exploration bonus.  A good random policy can lie outside of its basin.
-Linear policies of the
-state whose actions are mostly at their limits are few enough to be tried by random, and solve many
-control tasks roughly (H. Mania et al., NeurIPS 2018, search among them alone): on a pendulum about
-half of them pump energy into the swing.
+Linear policies of the state whose actions are mostly at their limits are few enough to be tried at
+random, and do much of what exploration needs (H. Mania et al., NeurIPS 2018, search among linear
+policies alone): on a pendulum about half of them pump energy into the swing.
 """
 
 from __future__ import annotations
@@ -29,7 +28,8 @@ LIMIT = 1.2
 """Of the scaled action: a little beyond that of the task, so that a fit to it reaches that."""
 
 ROLLOUTS = 20
-"""Model rollouts of each random policy.  The best one is compared by as many as all others."""
+"""Model rollouts of each random policy, on starts and noise of its own.  The best one is then
+compared by as many as all other policies, with the same numbers as they."""
 
 RIDGE = 1e-4
 """Of the fit of a policy to the best random one, for a kernel that is one at distance zero."""

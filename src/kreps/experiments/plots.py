@@ -156,7 +156,7 @@ def learning_curves(columns: Sequence[Column], title: str, source: str) -> Figur
                 ):
                     _draw_mean(axes, rows, value, name, color=colour, ls=line)
                 draw_references(axes, column.references, named=column is columns[-1])
-                axes.set_title(f"{column.title}{chr(10) if column.title else ''}{heading}")
+                axes.set_title("\n".join(filter(None, (column.title, heading))))
                 axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
             pair[1].set_xlabel("environment steps")
             add_robot_time(pair[1], column.period)

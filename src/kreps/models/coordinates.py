@@ -157,6 +157,7 @@ class _Part:
         for first in range(0, count, size):
             rows = slice(first, first + size)
             k = self._factor @ extended[rows].T
+            np.minimum(k, 0.0, out=k)  # rounding of a very narrow kernel could be far above
             if self._is_narrow:
                 np.maximum(k, SMALLEST_EXPONENT, out=k)
             yield rows, np.exp(k, out=k)
