@@ -181,7 +181,9 @@ def main() -> None:
     results, file = [], RESULTS / "suite.json"
     if file.exists():
         before = json.loads(file.read_text())
-        results = before["results"] if before["code"] == script_fingerprint(Path(__file__)) else []
+        results = (
+            before["results"] if before.get("code") == script_fingerprint(Path(__file__)) else []
+        )
     done = {(run["task"], run["seed"]) for run in results}
     jobs = [(task, seed) for seed in args.seeds for task in args.tasks if (task, seed) not in done]
     with ProcessPoolExecutor(args.workers) as pool:

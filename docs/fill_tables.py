@@ -13,7 +13,7 @@ import re
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
-LINK = re.compile(r"(\]\()(?!https?:)([^)]+\))")
+LINK = re.compile(r"(\]\()(?!https?:|#)([^)]+\))")
 SHOWN = re.compile(r"(<!-- results: (.+?) -->\n)(.*?)\n?(<!-- end of results -->)", re.DOTALL)
 
 

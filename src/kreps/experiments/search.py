@@ -2,11 +2,11 @@
 
 Each method has the same number of candidates on each task.  The first candidate is the method's
 preset, except where this needs a grid that is too large for the task.  With the preset ``authors``
-the candidates are values that their scripts try, so REPS, for which these name one value, is not
-searched; nor is the default of this library.  All candidates learn on the same seeds.  The score is
-the evaluated reward of the policy, half with its exploration and half without, averaged over the
-last updates and the seeds.  With exploration alone the search would choose value iteration with
-little exploration, whose greedy policy is far from its best.
+the candidates are values that their scripts try (on a grid, other grids), so REPS, for which these
+name one value, is not searched; nor is the default of this library.  All candidates learn on the
+same seeds.  The score is the evaluated reward of the policy, half with its exploration and half
+without, averaged over the last updates and the seeds.  With exploration alone the search would
+choose value iteration with little exploration, whose greedy policy is far from its best.
 """
 
 from __future__ import annotations
