@@ -28,6 +28,8 @@ RENEWAL = {
     "claims": "kreps reproduce all --trials 10 --workers 2",
     "coverage": "python benchmarks/coverage.py",
     "delays": "python benchmarks/delays.py",
+    "delay-learning": "python benchmarks/delay_learning.py --workers 2",
+    "few-data": "python benchmarks/few_data.py --workers 2",
     "figure-1a": "kreps reproduce figure-1a --trials 10 --workers 2",
     "figure-1b": "kreps reproduce figure-1b --trials 10 --workers 2",
     "figure-2b": "kreps reproduce figure-2b --trials 10 --workers 2",
