@@ -20,12 +20,12 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT / "docs"), str(ROOT / "benchmarks")]
 import coverage  # noqa: E402
 import delays  # noqa: E402
+import few_data  # noqa: E402
 import peers_seconds  # noqa: E402
 import peers_table  # noqa: E402
 import recorded_data  # noqa: E402
 import robot_time  # noqa: E402
 import stale_results  # noqa: E402
-import few_data  # noqa: E402
 import suite  # noqa: E402
 from fill_tables import filled  # noqa: E402
 
