@@ -1,6 +1,6 @@
 """Learning with delays and hidden state: writes ``results/delay-learning.json`` and ``.md``.
 
-    python benchmarks/delay_learning.py --seeds 1250 1251 --workers 2
+    python benchmarks/delay_learning.py --seeds 1300 1301 --workers 2
 
 The swing-up with each perturbation is learnt by `KREPS(env)` in three ways: with
 ``history="auto"``, from the last observation alone, and, as a reference, with the full hidden state
@@ -154,7 +154,7 @@ def draw(runs: list[dict[str, Any]]) -> Figure:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1250, 1251])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1300, 1301])
     parser.add_argument("--workers", type=int, default=1)
     arguments = parser.parse_args()
     path, code = RESULTS / "delay-learning.json", script_fingerprint(Path(__file__))
