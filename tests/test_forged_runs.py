@@ -328,7 +328,8 @@ def test_a_folder_is_free_after_a_kill_and_cleared_of_what_was_left(run: Path) -
     code += "with RunFolder(sys.argv[1]).learning():\n    os.kill(os.getpid(), 9)"
     done = subprocess.run([sys.executable, "-c", code, str(run)], check=False)
     assert done.returncode == -9 and (run / ".lock").exists()
-    (run / ".policy.safetensors.0123456789abcdef.part").write_bytes(b"half")
+    for name in ("config.json", "progress.csv", "policy.safetensors", "checkpoint.safetensors"):
+        (run / f".{name}.0123456789abcdef.part").write_bytes(b"half")
     (run / ".notes.txt.0123456789abcdef.part").write_bytes(b"of another program")
     call("resume", run, "--iterations", 4, "--no-report")
     hidden = [path.name for path in run.iterdir() if path.name.startswith(".")]

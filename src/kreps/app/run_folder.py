@@ -99,7 +99,12 @@ class RunFolder:
             StorageError: another process learns in it, or nothing can be written in it.
         """
         with locked(self.path / ".lock"):
-            for file in (self.progress_file, self.policy_file, self.checkpoint_file):
+            for file in (
+                self.config_file,
+                self.progress_file,
+                self.policy_file,
+                self.checkpoint_file,
+            ):
                 remove_parts(file)
             yield
 
