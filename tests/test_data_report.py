@@ -108,7 +108,7 @@ def test_a_full_report_has_what_needs_the_task() -> None:
     report = data_report(recorded(velocity=2.0 * CLEAN["angle"], gain=cost), TASK)
     by_name = {each.name: each for each in report}
     assert by_name["reward"].severity == "limit"
-    assert "1 is a copy of 0" in by_name["idle columns"].sentence
+    assert "velocity is a copy of angle" in by_name["idle columns"].sentence
     assert by_name["delay or hidden state"].remedy.endswith("(--set history=auto).")
 
 

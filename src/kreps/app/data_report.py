@@ -63,7 +63,8 @@ def data_report(recording: Recording, task: TaskSpec | None) -> list[Finding]:
         every = max(1, recording.rollouts.steps // FITTED_STEPS)
         window = ReplayWindow(task, None).append(recording.rollouts[::every])
         found += [*saturated_actions(recording, task), *_informative(window)]
-        more = idle_columns(window), action_cost(window), delay_or_hidden_state(window)
+        idle = idle_columns(window, recording.values.labels)
+        more = idle, action_cost(window), delay_or_hidden_state(window)
         found += [each for each in more if each is not None]
     return found
 

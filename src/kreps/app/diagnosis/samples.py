@@ -26,7 +26,7 @@ from kreps.models.dynamics import CONSTANT_RTOL
 
 @dataclass(frozen=True)
 class IdleColumns:
-    """Observation columns that tell nothing that other columns do not.
+    """Observation columns without information that other columns do not have.
 
     Attributes:
         constant: columns that never change.
@@ -101,8 +101,15 @@ def _has_effect(i: int, inputs: FloatArray, targets: FloatArray) -> bool:
     return bool((explained > EFFECT_NOTE).any())
 
 
-def idle_columns(window: ReplayWindow | None) -> Finding | None:
-    """Idle observation columns; None for images, or without samples."""
+def idle_columns(
+    window: ReplayWindow | None, labels: Sequence[str] | None = None
+) -> Finding | None:
+    """Idle observation columns; None for images, or without samples.
+
+    Args:
+        window: with the samples.
+        labels: names of the columns in a recording; None for their numbers.
+    """
     name = "idle columns"
     if window is None or not window.rollouts or window.task.image_shape is not None:
         return None
@@ -110,18 +117,21 @@ def idle_columns(window: ReplayWindow | None) -> Finding | None:
     if width > MAX_COLUMNS:
         return None
     found = IdleColumns.from_samples(window.rollouts.transitions, window.task)
+    names = [str(i) for i in range(width)] if labels is None else labels
+    constant, noise = (", ".join(names[i] for i in each) for each in (found.constant, found.noise))
     said = [
-        *([f"{_named(found.constant)} never changes"] if len(found.constant) == 1 else []),
-        *([f"{_named(found.constant)} never change"] if len(found.constant) > 1 else []),
-        *(f"{column} is a copy of {other}" for column, other in found.copies),
-        *([f"{_named(found.noise)} is noise"] if len(found.noise) == 1 else []),
-        *([f"{_named(found.noise)} are noise"] if len(found.noise) > 1 else []),
+        *([f"{constant} never changes"] if len(found.constant) == 1 else []),
+        *([f"{constant} never change"] if len(found.constant) > 1 else []),
+        *(f"{names[column]} is a copy of {names[other]}" for column, other in found.copies),
+        *([f"{noise} is noise"] if len(found.noise) == 1 else []),
+        *([f"{noise} are noise"] if len(found.noise) > 1 else []),
     ]
     idle = len(found.copies) + len(found.noise)
     if not said:
         sentence = f"None of the {width} observation columns is constant, a copy or noise."
         return Finding(name, "fine", 0.0, 0.0, sentence)
-    sentence = f"Of {width} observation columns (from 0), {'; '.join(said)}."
+    numbered = " (from 0)" if labels is None else ""
+    sentence = f"Of {width} observation columns{numbered}, {'; '.join(said)}."
     if not idle:
         return Finding(name, "fine", 0.0, 0.0, sentence)
     return Finding(
@@ -129,13 +139,11 @@ def idle_columns(window: ReplayWindow | None) -> Finding | None:
         "note",
         idle,
         0.0,
-        f"{sentence} They tell nothing, and samples that differ in them count as different.",
-        "leaving them out of the observation (gymnasium.wrappers.TransformObservation).",
+        f"{sentence} They add nothing, and samples that differ in them count as different.",
+        "leaving them out of the observation (gymnasium.wrappers.TransformObservation)."
+        if labels is None
+        else "leaving them out of the observations.",
     )
-
-
-def _named(columns: Sequence[int]) -> str:
-    return ", ".join(map(str, columns))
 
 
 def action_cost(window: ReplayWindow | None) -> Finding | None:
