@@ -5,7 +5,7 @@ BIN := .venv/bin
 
 SERIES := $(shell sed -n 's/^version = "\([0-9]*\.[0-9]*\)\..*/\1/p' pyproject.toml)
 
-.PHONY: demo test test-integrations docs docs-version check bench format clean constraints tables dist
+.PHONY: demo test test-integrations test-lerobot docs docs-version check bench format clean constraints tables dist
 
 demo: .venv/installed           ## learn the swing-up; writes pictures and policy to runs/demo
 	rm -rf runs/demo
@@ -15,7 +15,7 @@ test: .venv/installed           ## all tests
 	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 # These libraries are large and change often, so they are in no other environment.
-test-integrations:              ## tests beside Optuna, Stable-Baselines3, TensorBoard, W&B, MLflow and others
+test-integrations: test-lerobot ## tests beside Optuna, Stable-Baselines3, TensorBoard, W&B, MLflow and others
 	$(PYTHON) -m venv build/integrations
 	build/integrations/bin/python -m pip install --quiet --disable-pip-version-check pytest \
 	  -e ".[interop,mlflow,tensorboard,tune,wandb]"
@@ -23,6 +23,13 @@ test-integrations:              ## tests beside Optuna, Stable-Baselines3, Tenso
 	  sqlalchemy, stable_baselines3, tensorboard, wandb"
 	OPENBLAS_NUM_THREADS=1 build/integrations/bin/python -m pytest -rs \
 	  tests/test_callbacks.py tests/test_interop.py tests/test_tuning.py
+
+test-lerobot:                   ## LeRobot needs earlier versions of what the others are tested with
+	$(PYTHON) -m venv build/lerobot
+	build/lerobot/bin/python -m pip install --quiet --disable-pip-version-check pytest lerobot \
+	  -e ".[lerobot]"
+	build/lerobot/bin/python -c "import lerobot.datasets.lerobot_dataset"
+	build/lerobot/bin/python -m pytest -rs tests/test_recording_formats.py -k lerobot
 
 docs: .venv/installed           ## the documentation site in site/; a broken link is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
