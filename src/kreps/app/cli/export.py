@@ -149,7 +149,7 @@ def _write_model(policy: Policy, out: Path, to: str, dtype: str) -> str:
     arithmetic = write(out, dtype)
     kind = f"{noun} with {arithmetic} arithmetic"
     if dtype == "float32" != arithmetic:
-        kind += " (with so many centres float32 is not accurate enough; try --centres 50)"
+        kind += " (float32 is not accurate enough for this policy; a smaller --centres often helps)"
     return kind
 
 
