@@ -22,6 +22,8 @@ from kreps.app.data_report import (
     wrapped_angles,
 )
 from kreps.app.diagnosis import Finding
+from kreps.app.report import diagnosis_of
+from kreps.app.run_folder import RunFolder
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.learning.extrapolation import extrapolation_of
@@ -223,6 +225,20 @@ def test_a_first_policy_is_learnt_from_recorded_data_alone(
     more = ["train", "--data", data, "--spec", spec, "--iterations", "3", "--out", tmp_path / "x"]
     assert "recorded data give one update" in rejected(*more)
     assert not (tmp_path / "x").exists()
+
+
+def test_no_remedy_for_recorded_data_needs_an_environment(
+    files: tuple[Path, Path], tmp_path: Path
+) -> None:
+    data, spec = files
+    still = [Rollout(r.observations, r.actions, 0.0 * r.rewards) for r in pushes(6)]
+    kreps.save_rollouts(still, data)
+    run = tmp_path / "run"
+    code, text = call("train", "--data", data, "--spec", spec, "--out", run)
+    assert code == 0 and "goal. No rollout" in text and "resume" not in text
+    found = {finding.name: finding.remedy for finding in diagnosis_of(RunFolder(run))}
+    assert "goal" in found and "progress" not in found
+    assert "resume" not in " ".join(found.values())
 
 
 def test_the_commands_of_the_page_about_recorded_data_run(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -153,15 +154,21 @@ def diagnosis_of(folder: RunFolder) -> list[Finding]:
     Raises:
         ConfigurationError: the run has no iteration yet.
     """
-    rows = folder.recorded_rows()
+    rows, config = folder.recorded_rows(), folder.config()
     iteration = int(rows[-1]["iteration"])
     found = diagnose(
         rows,
         folder.evaluation(iteration),
-        references_of(folder.config()),
+        references_of(config),
         _attempt("findings about samples", folder.window),
         _attempt("findings about episodes", lambda: folder.evaluation_rollouts(iteration)),
     )
+    if config.data:  # one update, and no environment in which the run could go on
+        found = [
+            replace(f, remedy=re.sub(r" \(kreps resume RUN[^)]*\)", "", f.remedy))
+            for f in found
+            if f.name != "progress"
+        ]
     return [replace(f, remedy=f.remedy.replace("RUN", str(folder.path))) for f in found]
 
 

@@ -185,7 +185,7 @@ def _train_from_data(folder: RunFolder, config: RunConfig, spec: Spec) -> None:
         learner.learn_from(recording.rollouts, folder)
     say(f"Extrapolation: {learner.policy.extrapolation(recording.rollouts)}.")
     for finding in diagnosis_of(folder):
-        if finding.severity != "fine" and finding.name != "progress":  # there is one update only
+        if finding.severity != "fine":
             say_finding(finding)
     say_command("Findings:  ", f"kreps diagnose {folder.path}")
     say_command("Policy:    ", f"{folder.policy_file}  (kreps.load_policy reads it)")
