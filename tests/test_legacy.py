@@ -136,13 +136,14 @@ def test_settings_of_old_checkpoints_are_these() -> None:
     assert fourier.low_rank == LowRank(rank=15, above=0)
     assert fourier.value == RKHS(max_rank=16)
     assert fourier.model_based == ModelBased(
-        actions_per_state=1, improvement_steps=0, random_policies=0, gradient_steps=0
+        actions_per_state=1, improvement_steps=0, random_policies=0, regulators=0, gradient_steps=0
     )
     assert resume("default").settings.model_based == ModelBased(
         actions_per_state=2,
         acceptance_rollouts=10,
         improvement_steps=0,
         random_policies=0,
+        regulators=0,
         gradient_steps=0,
     )
     assert resume("value-iteration").settings.actions == 5
@@ -536,6 +537,7 @@ def test_the_first_checkpoints_keep_the_meaning_that_they_had() -> None:
         exploration_bonus=0.0,
         improvement_steps=0,
         random_policies=0,
+        regulators=0,
         gradient_steps=0,
     )
     assert with_model.window_steps == 0  # their windows count rollouts only

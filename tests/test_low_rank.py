@@ -304,6 +304,7 @@ def test_the_model_based_step_at_full_rank_is_that_of_an_exact_update(
         **{
             "model_based.improvement_steps": 0,
             "model_based.random_policies": 0,
+            "model_based.regulators": 0,
             "model_based.gradient_steps": 0,
         },
     )

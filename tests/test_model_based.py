@@ -266,6 +266,7 @@ def test_an_update_is_algorithm_1_and_the_two_generated_steps(low_rank: LowRank 
     steps = {
         "model_based.improvement_steps": 0,
         "model_based.random_policies": 0,
+        "model_based.regulators": 0,
         "model_based.gradient_steps": 0,
     }
     settings = settings_of(low_rank=low_rank, **steps)

@@ -413,6 +413,7 @@ def test_a_single_distinct_action_is_learnt(preset: str) -> None:
         without = {
             "model_based.exploration_bonus": 0.0,
             "model_based.random_policies": 0,
+            "model_based.regulators": 0,
             "model_based.gradient_steps": 0,
         }
         settings = settings_of(settings, **without)

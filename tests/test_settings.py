@@ -60,6 +60,7 @@ MODEL_BASED: dict[str, Any] = {
     "model_based.exploration_bonus": 0.1,
     "model_based.improvement_steps": 20,
     "model_based.random_policies": 20,
+    "model_based.regulators": 4,
     "model_based.gradient_steps": 40,
     "model_based.max_samples": 20_000,
 }
@@ -426,6 +427,7 @@ OUT_OF_RANGE: dict[str, list[Any]] = {
     "model_based.exploration_bonus": [-0.1, *NOT_FINITE, *NO_NUMBERS],
     "model_based.improvement_steps": [value for value in NO_COUNTS if value != 0],
     "model_based.random_policies": [value for value in NO_COUNTS if value != 0],
+    "model_based.regulators": [value for value in NO_COUNTS if value != 0],
     "model_based.gradient_steps": [value for value in NO_COUNTS if value != 0],
     "model_based.max_samples": NO_COUNTS,
 }
@@ -469,6 +471,7 @@ TOO_FAR: dict[str, list[Any]] = {
     "model_based.exploration_bonus": [],
     "model_based.improvement_steps": [100_001],
     "model_based.random_policies": [100_001],
+    "model_based.regulators": [100_001],
     "model_based.gradient_steps": [100_001],
     "model_based.max_samples": [10_000_001],
 }
@@ -537,6 +540,7 @@ AT_THE_EDGE: dict[str, list[Any]] = {
     "model_based.exploration_bonus": [0, 10.0],
     "model_based.improvement_steps": [0, 1],
     "model_based.random_policies": [0, 1],
+    "model_based.regulators": [0, 1],
     "model_based.gradient_steps": [0, 1],
     "growth": [0, 0.5],
 }

@@ -44,6 +44,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
         "restart_probability": 0.1,
         **TINY,
         "model_based.random_policies": 0,
+        "model_based.regulators": 0,
         "model_based.gradient_steps": 0,
     },
     "grid-value-iteration": {

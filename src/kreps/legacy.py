@@ -113,7 +113,7 @@ def checkpoint_settings(stored: Mapping[str, Any], method: str) -> dict[str, Any
         return present_settings(stored)
     settings = {**present_settings({**ADDED_IN_0_1, **stored}), **NOT_IN_0_1}
     if settings.get("model_based", True) is not None:
-        for name in ("improvement_steps", "random_policies", "gradient_steps"):
+        for name in ("improvement_steps", "random_policies", "regulators", "gradient_steps"):
             settings[f"model_based.{name}"] = 0
     return settings
 

@@ -127,6 +127,9 @@ class ModelBased(Checked):
         random_policies: number of random linear policies of an update, the best of which explores
             if its return in the model, with the bonus, is larger than that of the policy optimised
             with it; 0 for none.  There are none without an acceptance test.
+        regulators: number of equilibria near the samples with the largest rewards.  The best
+            linear-quadratic regulator of them in the model takes the place of the best policy if
+            its return is larger; 0 for none.  There are none without an acceptance test.
         gradient_steps: largest number of steps by the gradient of the return in model rollouts,
             from the best policy on; 0 for none.  There are none without an acceptance test.
         max_samples: largest number of generated actions of an update.
@@ -139,6 +142,7 @@ class ModelBased(Checked):
     exploration_bonus: float = 0.1
     improvement_steps: int = 20
     random_policies: int = 20
+    regulators: int = 4
     gradient_steps: int = 40
     max_samples: int = 20_000
 
@@ -151,6 +155,6 @@ class ModelBased(Checked):
             "acceptance_rollouts", Integral, none_or_some, lambda v: v == 0 or 2 <= v <= MAX_COUNT
         )
         steps = f"a whole number from 0 to {MAX_COUNT}"
-        for name in ("improvement_steps", "random_policies", "gradient_steps"):
+        for name in ("improvement_steps", "random_policies", "regulators", "gradient_steps"):
             self._check(name, Integral, steps, lambda v: 0 <= v <= MAX_COUNT)
         self._check("exploration_bonus", Real, "finite and >= 0", lambda v: 0 <= v < inf)

@@ -48,7 +48,7 @@ from kreps.data.rollouts import Rollout
 from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import FloatArray, as_float
 from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis
-from kreps.kernels.kernel import Kernel
+from kreps.kernels.kernel import Kernel, as_wide_as_spread
 from kreps.kernels.regression import FeatureRegression, LeaveOneOut, RegressionSums
 from kreps.kernels.sampling import uniform_subsample
 from kreps.models.dynamics import (
@@ -65,6 +65,9 @@ from kreps.models.terminations import (
     targets_of,
 )
 from kreps.models.transition import (
+    MODEL,
+    PRINTED,
+    LengthscalePrior,
     embedding_hyperparameters,
     embedding_origin,
     feature_differences,
@@ -186,9 +189,11 @@ class LowRankBatch:
             kernel,
             start,
             rng,
+            MODEL,
         )
         centres = partial(self._centres, rank=self.low_rank.rank)
-        terminations = fit_terminations_in_features(data, kernel, rng, centres)
+        wide = as_wide_as_spread(kernel, data.states)
+        terminations = fit_terminations_in_features(data, wide, rng, centres)
         self.jitters += [] if terminations is None else [terminations.jitter]
         dynamics = Dynamics(targets, model.mean, errors.errors, terminations)
         expected, errors = expected_features_of_samples(
@@ -262,6 +267,7 @@ class LowRankBatch:
         kernel: Kernel,
         start: FloatArray | None,
         rng: np.random.Generator,
+        lengthscale_prior: LengthscalePrior = PRINTED,
     ) -> Regressed:
         """A regression on states and actions, with hyper-parameters from the samples in memory.
 
@@ -270,10 +276,11 @@ class LowRankBatch:
             sums_in: maps features of states and actions to the function of a chunk that computes
                 its sums.
             kernel, start, rng: as of `transition_model`.
+            lengthscale_prior: of the regression.
         """
         inputs = state_actions(self.data, self.task)
         fitted, regulariser, x = embedding_hyperparameters(
-            inputs, targets, kernel, self.task, start, rng
+            inputs, targets, kernel, self.task, start, rng, lengthscale_prior
         )
         self.clock.lap("embedding fit")
         basis = self._centres(fitted, inputs, self.low_rank.rank)
@@ -355,7 +362,7 @@ class LowRankBatch:
         inputs, targets = all_inputs[rows], (self.rewards - self.rewards.mean())[rows, None]
         kernel = with_wrap_discontinuity(kernel, self.data, self.task, self.settings.value)
         fitted, regulariser, x = embedding_hyperparameters(
-            inputs, targets, kernel, self.task, start, rng
+            inputs, targets, kernel, self.task, start, rng, MODEL
         )
         basis = self._centres(fitted, inputs, self.low_rank.rank)
         sums = RegressionSums.from_samples(basis.features(inputs), targets)

@@ -32,9 +32,11 @@ from kreps.algorithms.generated import GeneratedSamples, StateSource, generate, 
 from kreps.algorithms.policy_gradient import improve
 from kreps.algorithms.policy_targets import PolicyFit, PolicyTargets
 from kreps.algorithms.random_policies import best_random_policy
+from kreps.algorithms.regulators import best_regulator
 from kreps.algorithms.reps import Batch, Step, stationarity_ridge
 from kreps.algorithms.state import LearnerState
 from kreps.kernels.arrays import FloatArray
+from kreps.kernels.kernel import Kernel
 from kreps.models.model_env import ModelEnv, supports_model_rollouts
 from kreps.models.novelty import novelty_bonus
 from kreps.models.world_model import WorldModel
@@ -136,6 +138,7 @@ def model_based_step(
     comparison = compare_in_model(world, model_based.acceptance_rollouts, seed)
     best, returns = optimise(batch, world, step, comparison, rng)
     if comparison is not None and returns is not None:
+        best, returns = with_regulators(batch, best, returns, comparison, step.kernel)
         best, returns = with_gradient_steps(batch, best, returns, comparison)
     rejected = None
     if comparison is not None and returns is not None and state.policy is not None:
@@ -217,6 +220,40 @@ def with_random_policies(
     found = better_of(best, returns, drawn, comparison)
     batch.clock.lap("random policies")
     return found
+
+
+def with_regulators(
+    batch: Batch[Any, Any],
+    best: GeneratedStep,
+    returns: FloatArray,
+    comparison: ModelComparison,
+    kernel: Kernel,
+) -> tuple[GeneratedStep, FloatArray]:
+    """A regulator in place of the policy of a step, if its returns (rollouts,) are larger.
+
+    Larger by a standard error; where episodes end, not smaller by one: if both keep an episode
+    going for a whole rollout, the regulator is more likely to do so for longer.
+
+    Args:
+        batch: the samples.
+        best, returns: the step, and the returns of its policy.
+        comparison: of policies in the model.
+        kernel: over states, at median lengthscales.
+    """
+    model_based = batch.settings.model_based
+    assert model_based is not None
+    if not model_based.regulators:
+        return best, returns
+    policy = on_its_centres(best.policy.policy)
+    regulator = best_regulator(comparison, policy, kernel, model_based.regulators)
+    if regulator is not None:
+        gain = comparison.returns(regulator) - returns
+        ends = comparison.from_starts.dynamics.terminations is not None
+        if gain.mean() > (-standard_error(gain) if ends else standard_error(gain)):
+            best = replace(best, policy=replace(best.policy, policy=regulator))
+            returns = returns + gain
+    batch.clock.lap("regulators")
+    return best, returns
 
 
 def with_gradient_steps(

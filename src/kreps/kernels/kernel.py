@@ -259,3 +259,13 @@ def median_lengthscales(
         d = d[d > DUPLICATE_RTOL * d.max(initial=0.0)]
         scales.append(np.sqrt(np.median(d)) if len(d) else 1.0)
     return np.array(scales)
+
+
+def as_wide_as_spread(kernel: Kernel, x: FloatArray) -> Kernel:
+    """A kernel whose lengthscales are no shorter than the spread of x (n, d) in each factor.
+
+    Where a policy holds a state, most pairs of samples are near each other.  Their median distance
+    then says nothing about the others, which are few and decide what a model predicts elsewhere.
+    """
+    spread = [np.sqrt(np.sum(np.var(f.coordinates(x), axis=0))) for f in kernel.factors]
+    return kernel.with_lengthscales(np.maximum(kernel.lengthscales, spread))

@@ -31,7 +31,7 @@ from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import Array, FloatArray, IntArray, columns, like
 from kreps.kernels.basis import PREDICTION_BATCH, Basis
-from kreps.kernels.kernel import Kernel
+from kreps.kernels.kernel import Kernel, as_wide_as_spread
 from kreps.kernels.regression import LeaveOneOut
 from kreps.models.coordinates import Regression, fit_coordinates
 from kreps.models.terminations import Terminations, fit_terminations
@@ -364,6 +364,6 @@ def fit_dynamics(
     regression, loo_residuals, x, jitter = fit_coordinates(
         data, targets, state_kernel, task, start, rng
     )
-    terminations = fit_terminations(data, state_kernel, rng)
+    terminations = fit_terminations(data, as_wide_as_spread(state_kernel, data.states), rng)
     dynamics = Dynamics(delta_targets, regression, loo_residuals, terminations)
     return dynamics, x, max(jitter, 0.0 if terminations is None else terminations.jitter)

@@ -94,6 +94,12 @@ class RolloutNoise:
         residual_signs = np.where(rng.integers(2, size=(count, 1)) == 0, 1.0, -1.0)
         return cls(action_noise, residual_signs, rng.uniform(size=count))
 
+    def of(self, rows: IntArray) -> RolloutNoise:
+        """That of some of the rollouts."""
+        return RolloutNoise(
+            self.action_noise[rows], self.residual_signs[rows], self.end_uniforms[rows]
+        )
+
 
 @dataclass(frozen=True)
 class ModelStep:
@@ -181,25 +187,26 @@ class ModelEnv:
             count: number of rollouts.
             rng: of starts and noise.
         """
-        steps = self.evaluation_steps
-        inputs, similarity, terminations, ended = [], [], [], []
-        over = np.zeros(count, dtype=bool)
+        steps, size = self.evaluation_steps, self.task.state_size + self.task.action_size
+        inputs = np.zeros((steps, count, size))
+        similarity, terminations = np.ones((steps, count)), np.zeros((steps, count))
+        ended = np.ones((steps, count), dtype=bool)
         states = self.starts(count, rng)
-        for _ in range(steps):
+        going = np.arange(count)  # the others have ended
+        for t in range(steps):
             noise = RolloutNoise.sample(count, self.task.action_size, rng)
-            step = self.step(policy.act, states, noise)
-            inputs.append(step.inputs)
-            similarity.append(step.similarity)
-            terminations.append(step.terminations)
-            ended.append(over)
-            over = over | step.terminated
-            states = step.successors
-        rewards = reward(np.concatenate(inputs), np.concatenate(terminations)).reshape(steps, count)
-        return ModelRollouts(
-            rewards=np.where(np.stack(ended), self.end_reward, rewards),
-            similarity=np.stack(similarity),
-            ended=np.stack(ended),
-        )
+            commanded = policy.act(states, noise.action_noise)
+            step = self.step_with(commanded[going], states[going], noise.of(going))
+            inputs[t, going], similarity[t, going] = step.inputs, step.similarity
+            terminations[t, going], ended[t, going] = step.terminations, False
+            states = states.copy()  # a policy may keep those that it was given
+            states[going] = step.successors
+            going = going[~step.terminated]
+            if not len(going):
+                break
+        rewards = np.full((steps, count), self.end_reward)
+        rewards[~ended] = reward(inputs[~ended], terminations[~ended])
+        return ModelRollouts(rewards, similarity, ended)
 
     @property
     def evaluation_steps(self) -> int:
