@@ -34,7 +34,7 @@ from kreps.data.task import TaskSpec
 from kreps.data.window import ReplayWindow
 from kreps.kernels.arrays import Array, FloatArray
 from kreps.kernels.basis import KernelExpansion
-from kreps.kernels.kernel import Kernel, SquaredExponential
+from kreps.kernels.kernel import Kernel, SquaredExponential, as_wide_as_spread
 from kreps.kernels.regression import KernelEmbedding
 from kreps.learning.collect import collect
 from kreps.models import coordinates
@@ -192,7 +192,8 @@ class AllSamples(ExactBatch):
     def _terminations_on_all(self, kernel: Kernel, rng: Any) -> Terminations | None:
         if not self.data.terminated.any():
             return None
-        kernel, regulariser = termination_hyperparameters(self.data, kernel, rng)
+        wide = as_wide_as_spread(kernel, self.data.states)
+        kernel, regulariser = termination_hyperparameters(self.data, wide, rng)
         successors = self.data.points[self.data.successor]
         targets = self.data.terminated[:, None].astype(np.float64)
         model = KernelEmbedding.fit(kernel, successors, regulariser)

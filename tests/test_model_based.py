@@ -358,6 +358,8 @@ def test_an_exact_policy_has_at_most_one_support_point_per_replayed_state() -> N
     settings = {
         "model_based.actions_per_state": 20,
         "model_based.model_rollout_fraction": 0.0,
+        "model_based.regulators": 0,
+        "model_based.gradient_steps": 0,
     }
     learner, info = updated(turns(), **settings)
     assert len(info.dual.weights) == 20 * 120
@@ -478,7 +480,8 @@ class Push:
 def test_a_rejected_policy_does_not_act(
     low_rank: LowRank | None, force: float, rejected: bool
 ) -> None:
-    settings = settings_of(low_rank=low_rank, kl_bound=0.01)
+    without = {"model_based.regulators": 0}
+    settings = settings_of(low_rank=low_rank, kl_bound=0.01, **without)
     previous: Any = Push(force)
     state = replace(LearnerState(ReplayWindow(TASK, 30)), policy=previous, iteration=9)
     after, info = update(state, faster(), settings, np.random.default_rng(0), Compute())

@@ -424,7 +424,9 @@ def test_a_single_distinct_action_is_learnt(preset: str) -> None:
         near = state.policy.states[weights > 0.01]
     else:
         near = np.concatenate([r.observations[:-1] for r in same])[info.dual.weights > 0.01]
-    np.testing.assert_allclose(state.policy.greedy(near), 0.5, atol=0.1)
+    # generated actions are around the policy, with its noise
+    tolerance = 0.1 if settings.model_based is None else 0.25
+    np.testing.assert_allclose(state.policy.greedy(near), 0.5, atol=tolerance)
 
 
 @pytest.mark.parametrize("preset", ["model_based", "single_step", "paper", "authors"])
