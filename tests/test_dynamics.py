@@ -351,3 +351,27 @@ def test_rounding_errors_are_not_scaled_up() -> None:
 
 def test_the_default_model_is_the_dynamics() -> None:
     assert kreps.KREPS(TASK).settings.model == "dynamics"
+
+
+def test_the_model_of_a_state_that_is_held_knows_the_others() -> None:
+    """Nine of ten samples are at rest: their median distance says nothing about those that move."""
+    rng = np.random.default_rng(0)
+
+    def steps(count: int, spread: FloatArray) -> Transitions:
+        """Steps of a stiff spring, one for each rollout."""
+        found = []
+        for scale in np.broadcast_to(spread, count):
+            (position, speed), force = scale * rng.normal(size=2), rng.uniform(-2.0, 2.0)
+            speed_after = speed - 0.5 * np.sin(2.0 * position) + 0.1 * force
+            after = np.array([position + 0.1 * speed_after, speed_after])
+            states = np.stack([[position, speed], after])
+            found.append(Rollout(states, np.full((1, 1), force), np.zeros(1)))
+        return Transitions.from_rollouts(found)
+
+    held = steps(500, np.where(np.arange(500) % 10 == 0, 1.0, 1e-3))
+    moving = steps(100, np.ones(1))
+    median = Kernel(TASK.state_factors, np.array([2e-3, 2e-3]))
+    dynamics, _, _ = fit_dynamics(held, median, TASK, None, np.random.default_rng(1))
+    successors, _ = dynamics.predict(state_actions(moving, TASK))
+    error = np.mean((successors - moving.points[moving.successor]) ** 2, axis=0)
+    assert np.all(error < 0.02 * np.var(moving.points[moving.successor] - moving.states, axis=0))

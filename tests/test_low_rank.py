@@ -168,6 +168,7 @@ class AllSamples(ExactBatch):
         if self.settings.model != "dynamics":
             return found
         assert found.parameters is not None
+        kernel = as_wide_as_spread(kernel, self.data.states)
         model = self._embedding_on_all(kernel, found.parameters)
         delta_targets = DeltaStateTargets.fit(self.data, TASK)
         targets = delta_targets.targets(self.data, TASK)
@@ -192,8 +193,7 @@ class AllSamples(ExactBatch):
     def _terminations_on_all(self, kernel: Kernel, rng: Any) -> Terminations | None:
         if not self.data.terminated.any():
             return None
-        wide = as_wide_as_spread(kernel, self.data.states)
-        kernel, regulariser = termination_hyperparameters(self.data, wide, rng)
+        kernel, regulariser = termination_hyperparameters(self.data, kernel, rng)
         successors = self.data.points[self.data.successor]
         targets = self.data.terminated[:, None].astype(np.float64)
         model = KernelEmbedding.fit(kernel, successors, regulariser)

@@ -8,14 +8,9 @@ import pytest
 from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.kernel import Kernel
-from kreps.kernels.regression import embedding_of
 from kreps.kernels.sampling import effective_target_count, pps_subsample
 from kreps.models.transition import (
-    MODEL,
-    PRINTED,
     HyperparameterFit,
-    LengthscalePrior,
     embedding_hyperparameters,
     fit_regression,
     state_actions,
@@ -94,32 +89,3 @@ def test_a_goal_in_eight_of_1500_samples_is_learnt() -> None:
         )
         assert np.mean(earned) > 30.0
         assert np.abs(np.mean(elsewhere)) < 5.0
-
-
-def test_lengthscales_of_a_model_are_as_wide_as_the_samples_are_spread() -> None:
-    """Most samples are at rest: their median distance says nothing about the few that move."""
-    rng = np.random.default_rng(0)
-    states = rng.normal(size=(500, 2)) * np.where(np.arange(500) % 10 == 0, 1.0, 1e-3)[:, None]
-    inputs = np.concatenate([states, rng.normal(size=(500, 1))], axis=1)
-    targets = np.sin(2.0 * inputs[:, :1]) + 0.3 * inputs[:, 1:2]
-    median = Kernel(TASK.state_factors, np.array([2e-3, 2e-3]))
-    spread = np.append(states.std(axis=0), inputs[:, 2].std())
-    kernels = {}
-    for prior in (PRINTED, MODEL):
-        fit = HyperparameterFit.from_samples(inputs, targets, median, TASK, None, rng, prior)
-        kernels[prior] = fit.kernel.lengthscales
-    np.testing.assert_allclose(kernels[MODEL][:2], spread[:2])
-    assert kernels[MODEL][2] >= spread[2]
-    np.testing.assert_allclose(kernels[PRINTED][:2], median.lengthscales)
-
-    moving = rng.normal(size=(100, 3))
-    wanted = np.sin(2.0 * moving[:, :1]) + 0.3 * moving[:, 1:2]
-
-    def error(prior: LengthscalePrior) -> float:
-        kernel, regulariser, _ = embedding_hyperparameters(
-            inputs, targets, median, TASK, None, np.random.default_rng(1), prior
-        )
-        predict = embedding_of(kernel, inputs, regulariser).predictor(targets)
-        return float(np.mean((predict(moving) - wanted) ** 2))
-
-    assert error(MODEL) < 0.02 < 0.2 < error(PRINTED)

@@ -65,9 +65,6 @@ from kreps.models.terminations import (
     targets_of,
 )
 from kreps.models.transition import (
-    MODEL,
-    PRINTED,
-    LengthscalePrior,
     embedding_hyperparameters,
     embedding_origin,
     feature_differences,
@@ -182,6 +179,7 @@ class LowRankBatch:
     ) -> StreamedExpectation:
         """Features of V at the successor that a regression of the state's change predicts."""
         data, task, state_features = self.data, self.task, features.state_features
+        kernel = as_wide_as_spread(kernel, data.states)
         targets = DeltaStateTargets.fit(data, task)
         model, errors, x, _ = self._regressed(
             targets.targets(data, task),
@@ -189,11 +187,9 @@ class LowRankBatch:
             kernel,
             start,
             rng,
-            MODEL,
         )
         centres = partial(self._centres, rank=self.low_rank.rank)
-        wide = as_wide_as_spread(kernel, data.states)
-        terminations = fit_terminations_in_features(data, wide, rng, centres)
+        terminations = fit_terminations_in_features(data, kernel, rng, centres)
         self.jitters += [] if terminations is None else [terminations.jitter]
         dynamics = Dynamics(targets, model.mean, errors.errors, terminations)
         expected, errors = expected_features_of_samples(
@@ -267,7 +263,6 @@ class LowRankBatch:
         kernel: Kernel,
         start: FloatArray | None,
         rng: np.random.Generator,
-        lengthscale_prior: LengthscalePrior = PRINTED,
     ) -> Regressed:
         """A regression on states and actions, with hyper-parameters from the samples in memory.
 
@@ -276,11 +271,10 @@ class LowRankBatch:
             sums_in: maps features of states and actions to the function of a chunk that computes
                 its sums.
             kernel, start, rng: as of `transition_model`.
-            lengthscale_prior: of the regression.
         """
         inputs = state_actions(self.data, self.task)
         fitted, regulariser, x = embedding_hyperparameters(
-            inputs, targets, kernel, self.task, start, rng, lengthscale_prior
+            inputs, targets, kernel, self.task, start, rng
         )
         self.clock.lap("embedding fit")
         basis = self._centres(fitted, inputs, self.low_rank.rank)
@@ -362,7 +356,7 @@ class LowRankBatch:
         inputs, targets = all_inputs[rows], (self.rewards - self.rewards.mean())[rows, None]
         kernel = with_wrap_discontinuity(kernel, self.data, self.task, self.settings.value)
         fitted, regulariser, x = embedding_hyperparameters(
-            inputs, targets, kernel, self.task, start, rng, MODEL
+            inputs, targets, kernel, self.task, start, rng
         )
         basis = self._centres(fitted, inputs, self.low_rank.rank)
         sums = RegressionSums.from_samples(basis.features(inputs), targets)

@@ -229,10 +229,10 @@ def with_regulators(
     comparison: ModelComparison,
     kernel: Kernel,
 ) -> tuple[GeneratedStep, FloatArray]:
-    """A regulator in place of the policy of a step, if its returns (rollouts,) are larger.
+    """Where episodes end, a regulator in the policy's place, unless a standard error worse.
 
-    Larger by a standard error; where episodes end, not smaller by one: if both keep an episode
-    going for a whole rollout, the regulator is more likely to do so for longer.
+    If both keep an episode going for a whole rollout, the regulator is more likely to do so for
+    longer.  Where no episode ends, regulators exploit errors of the model far from the equilibrium.
 
     Args:
         batch: the samples.
@@ -242,14 +242,14 @@ def with_regulators(
     """
     model_based = batch.settings.model_based
     assert model_based is not None
-    if not model_based.regulators:
+    terminations = comparison.from_starts.dynamics.terminations
+    if not model_based.regulators or terminations is None:
         return best, returns
     policy = on_its_centres(best.policy.policy)
     regulator = best_regulator(comparison, policy, kernel, model_based.regulators)
     if regulator is not None:
         gain = comparison.returns(regulator) - returns
-        ends = comparison.from_starts.dynamics.terminations is not None
-        if gain.mean() > (-standard_error(gain) if ends else standard_error(gain)):
+        if gain.mean() >= -standard_error(gain):
             best = replace(best, policy=replace(best.policy, policy=regulator))
             returns = returns + gain
     batch.clock.lap("regulators")

@@ -22,15 +22,10 @@ from kreps.kernels.basis import KernelExpansion, moments_of_centres, slopes_by_c
 from kreps.kernels.gram import BLOCK_ENTRIES
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.regression import embedding_of
-from kreps.models.transition import (
-    LengthscalePrior,
-    embedding_hyperparameters,
-    fit_regression,
-    state_actions,
-)
+from kreps.models.transition import embedding_hyperparameters, fit_regression, state_actions
 
-OF_ONE_COORDINATE = LengthscalePrior(log_std=2.0, at_least_spread=True)
-"""Prior of the lengthscales of one coordinate.  Its standard deviation is twice that of all
+LOG_LENGTHSCALE_STD = 2.0
+"""Prior standard deviation of a log lengthscale of one coordinate.  It is twice that of all
 coordinates together, as one of them depends on fewer columns."""
 
 MAX_ERROR_RATIO = 0.9
@@ -206,7 +201,7 @@ def fit_coordinates(
     for group in _groups(targets, task):
         target = targets[:, group]
         kernel, regulariser, _ = embedding_hyperparameters(
-            inputs, target, state_kernel, task, x, of_own, OF_ONE_COORDINATE
+            inputs, target, state_kernel, task, x, of_own, LOG_LENGTHSCALE_STD
         )
         single = embedding_of(kernel, inputs, regulariser)
         new = single.leave_one_out(target).errors

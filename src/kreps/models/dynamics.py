@@ -359,11 +359,12 @@ def fit_dynamics(
     Returns:
         The dynamics, the log hyper-parameters of the fit, and the largest jitter.
     """
+    state_kernel = as_wide_as_spread(state_kernel, data.states)
     delta_targets = DeltaStateTargets.fit(data, task)
     targets = delta_targets.targets(data, task)
     regression, loo_residuals, x, jitter = fit_coordinates(
         data, targets, state_kernel, task, start, rng
     )
-    terminations = fit_terminations(data, as_wide_as_spread(state_kernel, data.states), rng)
+    terminations = fit_terminations(data, state_kernel, rng)
     dynamics = Dynamics(delta_targets, regression, loo_residuals, terminations)
     return dynamics, x, max(jitter, 0.0 if terminations is None else terminations.jitter)

@@ -13,13 +13,7 @@ from kreps.data.rollouts import Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.hyperparameters import EmbeddingLoss, Prior, factor_distances, minimise
-from kreps.kernels.kernel import (
-    Kernel,
-    SquaredExponential,
-    as_wide_as_spread,
-    median_lengthscales,
-    wrap_factors,
-)
+from kreps.kernels.kernel import Kernel, SquaredExponential, median_lengthscales, wrap_factors
 from kreps.kernels.regression import KernelEmbedding, PivotedEmbedding, embedding_of
 from kreps.kernels.sampling import effective_target_count, pps_subsample
 from kreps.settings import RKHS, Grid
@@ -174,34 +168,13 @@ def state_actions(data: Transitions, task: TaskSpec) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class LengthscalePrior:
-    """The prior of the log lengthscales of a regression.
-
-    Attributes:
-        log_std: standard deviation.
-        at_least_spread: whether the mean is no shorter than the spread of the samples
-            (`as_wide_as_spread`), or the median distance alone.
-    """
-
-    log_std: float = LOG_LENGTHSCALE_STD
-    at_least_spread: bool = False
-
-
-PRINTED = LengthscalePrior()
-"""That of Eq. 4 in the paper's presets."""
-
-MODEL = LengthscalePrior(at_least_spread=True)
-"""That of the models of dynamics and reward that policies are rolled out in."""
-
-
-@dataclass(frozen=True)
 class HyperparameterFit:
     """The problem whose solution are the hyper-parameters of a regression on states and actions.
 
     The parameters are g + da log lengthscales, then log lambda.
 
     Attributes:
-        kernel: over states and actions, at the prior mean of its lengthscales.
+        kernel: over states and actions, at median lengthscales.
         loss: leave-one-out error on a subsample.
         prior: over the parameters.
         starts: at which the loss is evaluated; the search begins at the best of them.
@@ -221,7 +194,7 @@ class HyperparameterFit:
         task: TaskSpec,
         start: FloatArray | None,
         rng: np.random.Generator,
-        lengthscale_prior: LengthscalePrior = PRINTED,
+        log_lengthscale_std: float = LOG_LENGTHSCALE_STD,
     ) -> HyperparameterFit:
         """The problem for n samples; arguments as of `embedding_hyperparameters`."""
         action_factors = tuple(
@@ -231,24 +204,21 @@ class HyperparameterFit:
         squares = np.sum((targets - targets.mean(axis=0)) ** 2, axis=1)
         rows, weights = pps_subsample(squares, rng)
         action_lengthscales = median_lengthscales(action_factors, inputs, rng)
-        kernel = Kernel(factors, np.append(state_kernel.lengthscales, action_lengthscales))
-        if lengthscale_prior.at_least_spread:
-            kernel = as_wide_as_spread(kernel, inputs)
-        centre = np.log(kernel.lengthscales)
+        median = np.log(np.append(state_kernel.lengthscales, action_lengthscales))
         prior = Prior(
-            centre=np.append(centre, np.log(REGULARISER)),
-            std=np.append(np.full(len(factors), lengthscale_prior.log_std), LOG_REGULARISER_STD),
-            low=np.append(centre - LOG_LENGTHSCALE_RANGE, np.log(REGULARISER_RANGE[0])),
-            high=np.append(centre + LOG_LENGTHSCALE_RANGE, np.log(REGULARISER_RANGE[1])),
+            centre=np.append(median, np.log(REGULARISER)),
+            std=np.append(np.full(len(factors), log_lengthscale_std), LOG_REGULARISER_STD),
+            low=np.append(median - LOG_LENGTHSCALE_RANGE, np.log(REGULARISER_RANGE[0])),
+            high=np.append(median + LOG_LENGTHSCALE_RANGE, np.log(REGULARISER_RANGE[1])),
             # the loss is 2 / n times the negative log likelihood of Gaussian errors of fitted
             # variance, up to a constant
             strength=2.0 / effective_target_count(squares[rows], weights),
         )
         distances = factor_distances(factors, inputs[rows])
         loss = EmbeddingLoss(distances, targets[rows], weights / weights.mean())
-        noisy = np.append(centre, np.log(REGULARISER_OF_NOISY_DATA))
+        noisy = np.append(median, np.log(REGULARISER_OF_NOISY_DATA))
         starts = (prior.centre, noisy) if start is None else (start, prior.centre, noisy)
-        return cls(kernel, loss, prior, starts)
+        return cls(Kernel(factors, np.exp(median)), loss, prior, starts)
 
     def solve(self) -> FloatArray:
         """Log hyper-parameters (g + da + 1,) with the smallest loss plus prior."""
@@ -262,7 +232,7 @@ def embedding_hyperparameters(
     task: TaskSpec,
     start: FloatArray | None,
     rng: np.random.Generator,
-    lengthscale_prior: LengthscalePrior = PRINTED,
+    log_lengthscale_std: float = LOG_LENGTHSCALE_STD,
 ) -> tuple[Kernel, float, FloatArray]:
     """Kernel and regulariser of a regression, by leave-one-out error (Eq. 4), and their logs.
 
@@ -270,15 +240,14 @@ def embedding_hyperparameters(
         inputs: (n, ds + da) states and applied actions.
         targets: (n, r) such as features of the observed successors.
         state_kernel: over states, with g factors.  The kernel of the regression has these factors,
-            one per action coordinate, and other lengthscales.
+            one per action coordinate, and other lengthscales; these are the prior mean.
         task: number of action coordinates.
         start: log hyper-parameters (g + da + 1,) of the last fit, if there was one.
         rng: draws the samples of the fit.
-        lengthscale_prior: whose mean are the lengthscales of ``state_kernel`` and the median
-            distance of each action coordinate.
+        log_lengthscale_std: prior standard deviation of a log lengthscale.
     """
     fit = HyperparameterFit.from_samples(
-        inputs, targets, state_kernel, task, start, rng, lengthscale_prior
+        inputs, targets, state_kernel, task, start, rng, log_lengthscale_std
     )
     x = fit.solve()
     return fit.kernel.with_lengthscales(np.exp(x[:-1])), float(np.exp(x[-1])), x
@@ -317,12 +286,9 @@ def fit_regression(
     start: FloatArray | None,
     rng: np.random.Generator,
 ) -> tuple[KernelEmbedding | PivotedEmbedding, FloatArray]:
-    """A regression for predictions: in few pivots where these suffice, with the prior `MODEL`.
-
-    Arguments and errors as of `fit_embedding`.
-    """
+    """`fit_embedding` in few pivots where these suffice, for predictions rather than strengths."""
     inputs = state_actions(data, task)
     kernel, regulariser, x = embedding_hyperparameters(
-        inputs, targets, state_kernel, task, start, rng, MODEL
+        inputs, targets, state_kernel, task, start, rng
     )
     return embedding_of(kernel, inputs, regulariser), x
