@@ -12,6 +12,7 @@ import pytest
 from kreps.algorithms.acceptance import (
     ModelComparison,
     compare_in_model,
+    is_rejected,
     proposal_std_scale,
     standard_error,
     temperature_floor,
@@ -221,3 +222,11 @@ def test_all_policies_of_a_comparison_have_the_same_random_numbers() -> None:
     gain = little_more - returns
     assert gain.mean() > 0.0 and gain.std() < 0.2 * returns.std()
     assert not np.allclose(other.returns(Push(0.1, 0.5)), returns)
+
+
+def test_where_episodes_end_a_policy_that_is_no_better_is_rejected() -> None:
+    worse, equal, better = np.array([-0.1, 0.09]), np.zeros(2), np.array([-0.09, 0.1])
+    assert [is_rejected(gain, True) for gain in (worse, equal, better)] == [True, True, False]
+    # elsewhere one that is worse by less than a standard error, 0.095, is not
+    assert [is_rejected(gain, False) for gain in (worse, equal, better)] == [False] * 3
+    assert is_rejected(worse - 0.1, False)

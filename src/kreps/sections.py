@@ -115,7 +115,8 @@ class ModelBased(Checked):
         model_rollout_fraction: share of the generated actions in states that model rollouts of the
             new policy visit, in a second step.  The others are in replayed states, in the first.
         acceptance_rollouts: model rollouts per policy in the acceptance test.  The previous policy
-            is kept if the new return is lower by more than one standard error; 0 accepts all.
+            is kept if the new return is lower by more than one standard error, or where episodes
+            end if it is not higher; 0 accepts all.
         exploration_bonus: of R-max: reward per step of an unexplored region, as a share of the
             difference between the largest and the average reward, above the average, once there
             are the data of 30 mean rollouts.  It is multiplied by 0.35 with the data of each
@@ -127,9 +128,10 @@ class ModelBased(Checked):
         random_policies: number of random linear policies of an update, the best of which explores
             if its return in the model, with the bonus, is larger than that of the policy optimised
             with it; 0 for none.  There are none without an acceptance test.
-        regulators: number of equilibria near the samples with the largest rewards.  The best
-            linear-quadratic regulator of them in the model takes the place of the best policy if
-            its return is larger; 0 for none.  There are none without an acceptance test.
+        regulators: where episodes end, number of equilibria near a start state and the samples with
+            the largest rewards.  The best linear-quadratic regulator of them in the model takes the
+            place of the best policy unless it is worse by a standard error; 0 for none.  There are
+            none without an acceptance test.
         gradient_steps: largest number of steps by the gradient of the return in model rollouts,
             from the best policy on; 0 for none.  There are none without an acceptance test.
         max_samples: largest number of generated actions of an update.

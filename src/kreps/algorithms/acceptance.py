@@ -3,7 +3,7 @@
 A one-step update can exploit errors of V and of the model together.  Long model rollouts do not
 use V, so policies are compared by them, with common random numbers.  Of the policies of an update
 the best one is kept; the previous policy acts again where it is better by more than one standard
-error.
+error, and where episodes end, if it is no worse.
 
 Rewards are used as predicted, also in states that are unlike any sample: a reward of an unknown
 state that is too high is corrected by the rollouts that it attracts, and one that is shrunk towards
@@ -69,10 +69,28 @@ class ModelComparison:
         assert self.world.model_env is not None
         return replace(self.world.model_env, exploring_starts=0.0)
 
+    @property
+    def has_ends(self) -> bool:
+        """Whether an episode has terminated in the samples of the model."""
+        return self.from_starts.dynamics.terminations is not None
+
 
 def standard_error(gain: FloatArray) -> float:
     """Of the mean of differences (n,)."""
     return float(gain.std(ddof=1) / np.sqrt(len(gain)))
+
+
+def is_rejected(gain: FloatArray, has_ends: bool) -> bool:
+    """Whether the new policy is worse than the previous one by a standard error.
+
+    Where episodes end, whether it is no better: policies that keep all episodes going have equal
+    returns in the model, and one that has stood the test in truth is not given up for another.
+
+    Args:
+        gain: (rollouts,) returns of the new policy relative to the previous one.
+        has_ends: whether episodes end.
+    """
+    return bool(gain.mean() <= 0.0) if has_ends else bool(gain.mean() < -standard_error(gain))
 
 
 def compare_in_model(world: WorldModel, rollouts: int, seed: int) -> ModelComparison | None:

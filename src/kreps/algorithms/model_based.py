@@ -23,6 +23,7 @@ import numpy as np
 from kreps.algorithms.acceptance import (
     ModelComparison,
     compare_in_model,
+    is_rejected,
     proposal_std_scale,
     standard_error,
 )
@@ -143,7 +144,7 @@ def model_based_step(
     rejected = None
     if comparison is not None and returns is not None and state.policy is not None:
         gain = returns - comparison.returns(state.policy)
-        rejected = bool(gain.mean() < -standard_error(gain))
+        rejected = is_rejected(gain, comparison.has_ends)
         batch.clock.lap("acceptance test")
     explorer = None
     if optimistic.bonus is not None:
@@ -234,16 +235,11 @@ def with_regulators(
     If both keep an episode going for a whole rollout, the regulator is more likely to do so for
     longer.  Where no episode ends, regulators exploit errors of the model far from the equilibrium.
 
-    Args:
-        batch: the samples.
-        best, returns: the step, and the returns of its policy.
-        comparison: of policies in the model.
-        kernel: over states, at median lengthscales.
+    ``kernel`` is that over states, at median lengthscales.
     """
     model_based = batch.settings.model_based
     assert model_based is not None
-    terminations = comparison.from_starts.dynamics.terminations
-    if not model_based.regulators or terminations is None:
+    if not model_based.regulators or not comparison.has_ends:
         return best, returns
     policy = on_its_centres(best.policy.policy)
     regulator = best_regulator(comparison, policy, kernel, model_based.regulators)
