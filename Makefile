@@ -5,7 +5,7 @@ BIN := .venv/bin
 
 SERIES := $(shell sed -n 's/^version = "\([0-9]*\.[0-9]*\)\..*/\1/p' pyproject.toml)
 
-.PHONY: demo test test-integrations test-lerobot docs docs-version check bench format clean constraints tables dist
+.PHONY: demo test test-integrations test-lerobot docs tutorials site docs-version check bench format clean constraints tables dist
 
 demo: .venv/installed           ## learn the swing-up; writes pictures and policy to runs/demo
 	rm -rf runs/demo
@@ -31,7 +31,12 @@ test-lerobot:                   ## LeRobot needs earlier versions of what the ot
 	build/lerobot/bin/python -c "import lerobot.datasets.lerobot_dataset"
 	build/lerobot/bin/python -m pytest -rs tests/test_recording_formats.py -k lerobot
 
-docs: .venv/installed           ## the documentation site in site/; a broken link is an error
+docs: tutorials site            ## run the tutorials, then build the documentation site in site/
+
+tutorials: .venv/installed      ## run each tutorial; what it prints has to be what it shows
+	OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 tests/test_snippets.py -k test_a_tutorial
+
+site: .venv/installed           ## the site alone; a broken link is an error
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 docs-version: .venv/installed   ## commits the site of this version to the branch gh-pages; pushes nothing
