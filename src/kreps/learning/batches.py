@@ -19,6 +19,10 @@ from kreps.settings import OnPolicySettings
 MIN_ROLLOUTS = 2
 """Smallest size of a growing batch, in mean rollouts: one of the policy and one of the explorer."""
 
+MAX_ROLLOUT = 2.0
+"""Largest length of a rollout of a growing batch, in mean rollouts: a longer one would take the
+steps of the rest of a small batch, whose rollouts should start in more than one state."""
+
 MAX_SHORT_ROLLOUTS = 10
 """Largest number of rollouts per mean rollout of a growing batch, however early episodes end."""
 
@@ -128,6 +132,9 @@ class BatchPlan:
             part: of this batch.
             decisions: largest number of decisions in an episode; None without a limit.
         """
+        if self.settings.growth:
+            longest = ceil(MAX_ROLLOUT / self.settings.p)
+            decisions = longest if decisions is None else min(decisions, longest)
         return planned_rollouts(
             part.count,
             first=part.first,
