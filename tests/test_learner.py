@@ -382,14 +382,14 @@ def test_stochastic_prediction_differs_from_call_to_call(learnt: kreps.KREPS) ->
     candidates = np.random.default_rng(0).uniform([-1.5, -8.0], [4.7, 8.0], (500, 2))
     state = candidates[np.argmin(np.abs(policy.process.greedy(candidates)[:, 0]))]
     actions = [float(policy.predict(state)[0][0]) for _ in range(300)]
-    assert len(set(actions)) > 200
+    assert len(set(actions)) > 100
 
 
 def test_predict_of_the_learner_differs_from_call_to_call_too(learnt: kreps.KREPS) -> None:
     candidates = np.random.default_rng(0).uniform([-1.5, -8.0], [4.7, 8.0], (500, 2))
     state = candidates[np.argmin(np.abs(learnt.policy.process.greedy(candidates)[:, 0]))]
     actions = [float(learnt.predict(state)[0][0]) for _ in range(300)]
-    assert len(set(actions)) > 200
+    assert len(set(actions)) > 100
 
 
 @dataclass(frozen=True)

@@ -432,8 +432,9 @@ def test_the_example_learns_from_a_robot_in_another_process(
     monkeypatch.setattr(sys, "argv", [str(script), *options])
     names = runpy.run_path(str(script), run_name="__main__")
     state = names["learner"].state
-    assert state.iteration == 1 and state.rollouts == 10 == len(ends(tmp_path))
+    # as many as have the steps of ten mean rollouts, none of them longer than two
+    assert state.iteration == 1 and 10 <= state.rollouts == len(ends(tmp_path)) <= 20
     points = state.window.rollouts.points
     hanging = np.abs(points[:, 0] - np.pi) + np.abs(points[:, 1])
-    assert 10 <= np.sum(hanging == 0.0) <= 20  # each rollout starts so
+    assert state.rollouts <= np.sum(hanging == 0.0) <= 2 * state.rollouts  # each starts so
     assert points[:, 2].std() > 10.0  # N m: torques were applied
