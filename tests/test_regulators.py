@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
+import kreps
 from kreps.algorithms.acceptance import ModelComparison
+from kreps.algorithms.model_based import with_regulators
+from kreps.algorithms.policy_targets import PolicyFit
 from kreps.algorithms.regulators import (
     Linearisation,
     Regulator,
@@ -18,7 +23,9 @@ from kreps.algorithms.regulators import (
     equilibrium,
     regulator_gains,
     regulators,
+    spread,
 )
+from kreps.algorithms.state import Stopwatch
 from kreps.data.history import stacked
 from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
@@ -107,7 +114,7 @@ def test_gains_are_those_of_the_riccati_equation() -> None:
     rng = np.random.default_rng(0)
     a, b = np.eye(3) + 0.3 * rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
     for action_cost, p in ((0.01, 0.0), (0.5, 0.05)):
-        gains, offset = regulator_gains(Linearisation(a, b, np.zeros(3)), action_cost, p)
+        gains, offset = regulator_gains(Linearisation(a, b, np.zeros(3)), action_cost, p, 3)
         # a discount scales both matrices by its root
         root = np.sqrt(1.0 - p)
         cost = solve_discrete_are(root * a, root * b, np.eye(3), action_cost * np.eye(2))
@@ -120,7 +127,7 @@ def test_gains_are_those_of_the_riccati_equation() -> None:
 def test_the_offset_counters_a_drift() -> None:
     """A wind of 0.3 per step on an integrator: the action that cancels it keeps the state."""
     model = Linearisation(np.eye(1), np.eye(1), np.array([0.3]))
-    gains, offset = regulator_gains(model, 0.01, 0.001)
+    gains, offset = regulator_gains(model, 0.01, 0.001, 1)
     x = np.zeros(1)
     for _ in range(50):
         x = x + gains @ x + offset + 0.3
@@ -131,8 +138,8 @@ def test_modes_that_the_action_does_not_move_are_left_out() -> None:
     """An unstable coordinate beside the one that is regulated: its gains would be huge."""
     a, b = np.diag([1.1, 1.5]), np.array([[1.0], [0.01]])
     np.testing.assert_allclose(controllable(Linearisation(a, b, np.zeros(2))), np.diag([1.0, 0.0]))
-    gains, _ = regulator_gains(Linearisation(a, b, np.zeros(2)), 0.01, 0.01)
-    alone, _ = regulator_gains(Linearisation(a[:1, :1], b[:1], np.zeros(1)), 0.01, 0.01)
+    gains, _ = regulator_gains(Linearisation(a, b, np.zeros(2)), 0.01, 0.01, 2)
+    alone, _ = regulator_gains(Linearisation(a[:1, :1], b[:1], np.zeros(1)), 0.01, 0.01, 1)
     np.testing.assert_allclose(gains, [[alone[0, 0], 0.0]], atol=1e-12)
 
 
@@ -164,3 +171,76 @@ def test_the_best_regulator_keeps_the_pole_upright(compared: ModelComparison) ->
     assert found is not None
     assert steps_upright(found) == 300  # type: ignore[arg-type]
     np.testing.assert_allclose(found.standard_deviation(states), 0.01 * 2.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("ends", "count", "taken"), [(True, 2, True), (False, 2, False), (True, 0, False)]
+)
+def test_regulators_are_candidates_where_episodes_end(
+    compared: ModelComparison, ends: bool, count: int, taken: bool
+) -> None:
+    world, env = compared.world, compared.from_starts
+    states = world.states[::5]
+    none, one = np.zeros((len(states), 1)), np.ones(len(states))
+    policy = CostSensitiveGP(TASK, env.kernel, states, none, one, 1.0, 0.25)
+    batch: Any = SimpleNamespace(
+        settings=SimpleNamespace(model_based=kreps.ModelBased(regulators=count)), clock=Stopwatch()
+    )
+    step: Any = Generated(PolicyFit(policy, np.zeros(1), len(states), 0.25))
+    before = compared.returns(policy)
+    case = replace(compared, has_ends=ends)
+    found, returns = with_regulators(batch, step, before, case, env.kernel)
+    assert (found is not step) is taken
+    np.testing.assert_array_equal(returns, case.returns(found.policy.policy))
+    if taken:
+        assert returns.mean() > before.mean()
+        assert found.policy.noise == pytest.approx(1e-4)
+        # one that is already there is not given up for one that is worse
+        hopeless = returns + 1.0
+        again, kept = with_regulators(batch, found, hopeless, case, env.kernel)
+        assert again is found and kept is hopeless
+
+
+@dataclass(frozen=True)
+class Generated:
+    """Of a generated step what `with_regulators` changes."""
+
+    policy: PolicyFit
+
+
+def test_a_chain_of_delayed_actions_is_regulated() -> None:
+    """Position, two waiting actions: the matrix of modes is singular."""
+    a = np.array([[1.0, 0.0, 0.5], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    model = Linearisation(a, np.array([[0.0], [1.0], [0.0]]), np.zeros(3))
+    np.testing.assert_array_equal(controllable(model), np.eye(3))
+    gains, offset = regulator_gains(model, 0.01, 0.0, 1)
+    x = np.array([1.0, 0.0, 0.0])
+    for _ in range(12):
+        x = a @ x + model.control[:, 0] * (gains @ x + offset)[0]
+    assert abs(x[0]) < 1e-2
+
+
+def test_constant_coordinates_and_angles_have_a_scale() -> None:
+    task = TaskSpec(3, np.array([-1.0]), np.array([1.0]), periodic=(2,))
+    angles = np.where(np.arange(100) % 2 == 0, 3.1, -3.1)  # hanging, on both sides of pi
+    states = np.stack([np.linspace(0.0, 1.0, 100), np.full(100, 0.1), angles], axis=1)
+    found = spread(states, task)
+    np.testing.assert_allclose(found, [states[:, 0].std(), 1.0, np.sin(np.pi - 3.1)], rtol=1e-6)
+    regulator = Regulator(task, np.array([0.0, 0.0, 3.1]), np.zeros(1), np.array([[0.0, 0.0, 2.0]]))
+    turned = regulator.scaled(np.array([[0.0, 0.0, 3.1], [0.0, 0.0, 3.2 - 2.0 * np.pi]]))
+    np.testing.assert_allclose(turned, [[0.0], [2.0 * np.sin(0.1)]], atol=1e-12)
+
+
+def test_derivatives_that_are_not_finite_give_no_regulator(compared: ModelComparison) -> None:
+    @dataclass(frozen=True)
+    class Broken:
+        """Dynamics whose derivatives overflow."""
+
+        def jacobian(self, inputs: FloatArray) -> FloatArray:
+            return np.full((len(inputs), 3, 4), np.nan)
+
+        def predict(self, inputs: FloatArray) -> tuple[FloatArray, FloatArray]:
+            return inputs[:, :3], np.zeros(len(inputs))
+
+    broken: Any = Broken()
+    assert regulators(replace(compared.world, dynamics=broken), compared.from_starts, 3) == []

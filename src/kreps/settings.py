@@ -75,9 +75,11 @@ class OnPolicySettings(LearnerSettings):
             newest rollouts depends on the state.
         growth: if positive, batches are counted in environment steps and grow with the data: each
             later update has new steps of this share of those seen so far, but at least as many as
-            two mean rollouts and at most as many as ``rollouts_per_iteration``.  More rollouts
-            are made where episodes end early, up to ten times as many.
-        rollout_lengths: how the lengths are drawn, which are (1 - p) / p steps on average.
+            two mean rollouts and at most as many as ``rollouts_per_iteration``.  No rollout is
+            longer than two mean rollouts, and more of them are made where episodes end early, up
+            to ten times as many.
+        rollout_lengths: how the lengths are drawn, which are (1 - p) / p steps on average before
+            any limit.
             ``"independent"``: each by itself, as printed.  ``"stratified"``: each from the same
             distribution, but one from each of R equally likely ranges for R rollouts, so that
             their total varies less.

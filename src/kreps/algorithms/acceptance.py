@@ -44,11 +44,14 @@ class ModelComparison:
         world: the learnt model.
         rollouts: number of rollouts of each policy.
         seed: of starts and noise, which are the same for all policies.
+        has_ends: whether any episode of the task has terminated, also if the window has no such
+            rollout any more.
     """
 
     world: WorldModel
     rollouts: int
     seed: int
+    has_ends: bool = False
 
     def returns(self, policy: StochasticPolicy) -> FloatArray:
         """Average reward per step (rollouts,) from each start, standardised.
@@ -69,11 +72,6 @@ class ModelComparison:
         assert self.world.model_env is not None
         return replace(self.world.model_env, exploring_starts=0.0)
 
-    @property
-    def has_ends(self) -> bool:
-        """Whether an episode has terminated in the samples of the model."""
-        return self.from_starts.dynamics.terminations is not None
-
 
 def standard_error(gain: FloatArray) -> float:
     """Of the mean of differences (n,)."""
@@ -90,19 +88,22 @@ def is_rejected(gain: FloatArray, has_ends: bool) -> bool:
         gain: (rollouts,) returns of the new policy relative to the previous one.
         has_ends: whether episodes end.
     """
-    return bool(gain.mean() <= 0.0) if has_ends else bool(gain.mean() < -standard_error(gain))
+    smallest = 0.0 if has_ends else -standard_error(gain)
+    return not (gain.mean() > smallest if has_ends else gain.mean() >= smallest)
 
 
-def compare_in_model(world: WorldModel, rollouts: int, seed: int) -> ModelComparison | None:
+def compare_in_model(
+    world: WorldModel, rollouts: int, seed: int, has_ends: bool = False
+) -> ModelComparison | None:
     """The comparison of an update; None where there is none.
 
     Args:
-        world, seed: as of `ModelComparison`.
+        world, seed, has_ends: as of `ModelComparison`.
         rollouts: per policy; 0 for no comparison.
     """
     if world.model_env is None or not rollouts:
         return None
-    return ModelComparison(world, rollouts, seed)
+    return ModelComparison(world, rollouts, seed, has_ends)
 
 
 def temperature_floor(tested: bool, settings: Settings) -> float:

@@ -136,7 +136,8 @@ def model_based_step(
     optimistic, reward_start = world_model(batch, step, state, rng)
     world = replace(optimistic, bonus=None)
     seed = int(rng.integers(2**63))  # policies are compared with the same random numbers
-    comparison = compare_in_model(world, model_based.acceptance_rollouts, seed)
+    has_ends = state.terminated or bool(batch.data.terminated.any())
+    comparison = compare_in_model(world, model_based.acceptance_rollouts, seed, has_ends)
     best, returns = optimise(batch, world, step, comparison, rng)
     if comparison is not None and returns is not None:
         best, returns = with_regulators(batch, best, returns, comparison, step.kernel)
@@ -244,10 +245,15 @@ def with_regulators(
     policy = on_its_centres(best.policy.policy)
     regulator = best_regulator(comparison, policy, kernel, model_based.regulators)
     if regulator is not None:
-        gain = comparison.returns(regulator) - returns
-        if gain.mean() >= -standard_error(gain):
-            best = replace(best, policy=replace(best.policy, policy=regulator))
-            returns = returns + gain
+        new_returns = comparison.returns(regulator)
+        if not is_rejected(new_returns - returns, False):
+            fit = replace(
+                best.policy,
+                policy=regulator,
+                support=len(regulator.states),
+                noise=regulator.noise,
+            )
+            best, returns = replace(best, policy=fit), new_returns
     batch.clock.lap("regulators")
     return best, returns
 

@@ -2,11 +2,11 @@
 
 Bounded steps and the gradient improve a policy by small changes.  Where the dynamics are unstable
 their results stay far behind what the model allows: from 330 steps of a double pendulum they keep
-it up for 20 steps, and the feedback that is optimal for the linearised model for 600.
+it up for 20 steps, and the feedback that is optimal for the linearised model for 200 or more.
 
-So the model is linearised in equilibria near the samples of the largest reward, and the
-linear-quadratic regulator of each, which keeps the state there, is a candidate.  The best of them
-takes the place of the policy if it is better in the model.
+So where episodes end the model is linearised in equilibria near a start state and the samples of
+the largest reward, and the linear-quadratic regulator of each, which keeps the state there, is a
+candidate.  The best of them takes the place of the policy unless it is worse in the model.
 
 Deviations of the state are in standard deviations of the samples, and a regulator minimises the sum
 of their squares and of a multiple of the squared scaled action.  The reward decides only which
@@ -25,8 +25,9 @@ from kreps.algorithms.policy_targets import MIN_ACTION_VARIANCE
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import RKHSBasis
-from kreps.kernels.kernel import Kernel
+from kreps.kernels.kernel import Kernel, as_wide_as_spread
 from kreps.kernels.linalg import solve_lower_transposed
+from kreps.models.dynamics import CONSTANT_RTOL
 from kreps.models.model_env import ModelEnv
 from kreps.models.world_model import WorldModel
 from kreps.policies.sparse_gp import SparseGP
@@ -43,21 +44,24 @@ EQUILIBRIUM_ERROR = 1e-3
 be from them."""
 
 MIN_DISTANCE = 0.05
-"""Smallest mean squared distance of two equilibria, in standard deviations."""
+"""Smallest mean squared distance, in variances, of two samples near which there are equilibria."""
 
 MIN_CONTROLLABILITY = 0.1
 """Effect of the action on a mode of the linearised model, relative to the largest one, below which
 the mode is left out.  Coordinates that follow from others (the cosine of an angle beside its sine),
 noise and goals make such modes, and a regulator would move them at any price."""
 
+MAX_CONDITION = 1e8
+"""Of the matrix of modes; with a larger one they are no basis."""
+
 MAX_RICCATI_STEPS, RICCATI_RTOL, MAX_COST = 300, 1e-6, 1e12
 """Riccati recursions at most, the relative change after which there is no further one, and the cost
 at which the recursion diverges."""
 
 WIDER, MAX_CENTRES, MAX_RESIDUAL = 3.0, 300, 1e-10
-"""The policy that is fitted to a regulator: its lengthscales in median distances, the number of its
-centres, and the squared residual of the kernel at which these are enough.  A linear function needs
-long lengthscales."""
+"""The policy that is fitted to a regulator: its lengthscales in spreads of the samples, the number
+of its centres, and the squared residual of the kernel at which these are enough.  A linear function
+needs long lengthscales."""
 
 TINY = 1e-100
 """Smallest variance of samples around a state."""
@@ -76,7 +80,7 @@ class Linearisation:
     Attributes:
         transition: (ds, ds) A.
         control: (ds, da) B.
-        drift: (ds,) the change of the state itself.
+        drift: (ds,) predicted change of the state.
     """
 
     transition: FloatArray
@@ -158,12 +162,14 @@ def equilibrium(
 
 
 def controllable(model: Linearisation) -> FloatArray:
-    """Projection (ds, ds) on the modes that the action moves, along the others."""
+    """Projection (ds, ds) on the modes that the action moves, along the others.
+
+    The identity where the modes are no basis, as in a chain of delayed actions.
+    """
     _, modes = np.linalg.eig(model.transition)
-    try:
-        left = np.linalg.inv(modes)
-    except np.linalg.LinAlgError:  # a defective matrix: all modes are kept
+    if not np.linalg.cond(modes) < MAX_CONDITION:
         return np.eye(len(modes))
+    left = np.linalg.inv(modes)
     effect = np.linalg.norm(left @ model.control, axis=1) / np.linalg.norm(left, axis=1)
     others = effect < MIN_CONTROLLABILITY * effect.max()
     projection: FloatArray = np.eye(len(modes)) - np.real(modes[:, others] @ left[others])
@@ -171,7 +177,7 @@ def controllable(model: Linearisation) -> FloatArray:
 
 
 def regulator_gains(
-    model: Linearisation, action_cost: float, restart_probability: float
+    model: Linearisation, action_cost: float, restart_probability: float, observed: int
 ) -> tuple[FloatArray, FloatArray]:
     """Gains (da, ds) and an offset (da,) of the action, which counter deviations and the drift.
 
@@ -179,6 +185,8 @@ def regulator_gains(
         model: around the state that is kept.
         action_cost: price of the squared scaled action.
         restart_probability: p; with it the process restarts, so that later costs count less.
+        observed: number of coordinates, the first ones, whose deviations have a cost.  Earlier
+            changes and actions in the state have none.
     """
     size, width = model.control.shape
     projection = controllable(model)
@@ -187,7 +195,7 @@ def regulator_gains(
     a[:size, :size], a[:size, size] = model.transition @ projection, projection @ model.drift
     a[size, size], b[:size] = 1.0, model.control
     state_cost = np.zeros((size + 1, size + 1))
-    state_cost[:size, :size] = projection.T @ projection
+    state_cost[:size, :size] = projection[:observed].T @ projection[:observed]
     cost, gains, go_on = state_cost, np.zeros((width, size + 1)), 1.0 - restart_probability
     for _ in range(MAX_RICCATI_STEPS):
         of_control = b.T @ cost
@@ -210,8 +218,7 @@ def regulators(world: WorldModel, model_env: ModelEnv, count: int) -> list[Regul
         model_env: of the same samples.
         count: number of equilibria.
     """
-    scale = world.states.std(axis=0)
-    scale = np.where(scale > 0.0, scale, 1.0)
+    scale = spread(world.states, world.task)
     size, width = len(world.states), world.task.action_size
     inputs = np.concatenate([world.states, np.zeros((size, width))], axis=1)
     rewards = world.reward_model(inputs, np.zeros(size))
@@ -223,15 +230,44 @@ def regulators(world: WorldModel, model_env: ModelEnv, count: int) -> list[Regul
             sample = world.states[np.argmax(np.where(apart, rewards, -np.inf))]
         distance = np.mean((differences(world.states, sample, world.task) / scale) ** 2, axis=1)
         apart &= distance > MIN_DISTANCE
-        state, action = equilibrium(world, model_env, sample, scale)
-        model = linearised(world, state, action, scale)
-        for action_cost in ACTION_COSTS:
-            gains, offset = regulator_gains(model, action_cost, model_env.restart_probability)
-            if np.isfinite(gains).all():
-                found.append(Regulator(world.task, state, action + offset, gains / scale))
+        try:
+            found += regulators_at(world, model_env, sample, scale)
+        except np.linalg.LinAlgError:  # derivatives of the model that are not finite
+            continue
         if not apart.any():
             break
     return found
+
+
+def regulators_at(
+    world: WorldModel, model_env: ModelEnv, sample: FloatArray, scale: FloatArray
+) -> list[Regulator]:
+    """Regulators of the equilibrium near a sample (ds,), for each of the action costs.
+
+    Raises:
+        LinAlgError: the derivatives of the model are not finite.
+    """
+    state, action = equilibrium(world, model_env, sample, scale)
+    model, found = linearised(world, state, action, scale), []
+    p, observed = model_env.restart_probability, world.task.observation_size
+    for action_cost in ACTION_COSTS:
+        gains, offset = regulator_gains(model, action_cost, p, observed)
+        regulator = Regulator(world.task, state, action + offset, gains / scale)
+        if all(np.isfinite(each).all() for each in (state, regulator.action, regulator.gains)):
+            found.append(regulator)
+    return found
+
+
+def spread(states: FloatArray, task: TaskSpec) -> FloatArray:
+    """Standard deviation (ds,) of states (n, ds); of angles that of the point on the circle.
+
+    One for coordinates that are constant up to rounding.
+    """
+    found, angles = states.std(axis=0), list(task.periodic)
+    turns = np.exp(1j * states[:, angles])
+    found[angles] = turns.std(axis=0)
+    constant = found <= CONSTANT_RTOL * np.abs(states).max(axis=0)
+    return np.where(constant, 1.0, found)
 
 
 def best_regulator(
@@ -262,10 +298,11 @@ def fitted(regulator: Regulator, policy: SparseGP, kernel: Kernel, states: Float
 
     Args:
         regulator: that the mean is fitted to at the states.
-        policy: of the same task.
+        policy: that all but kernel, centres, mean and variances are taken from.
         kernel: over states, at median lengthscales.
         states: (n, ds), among which its centres are.
     """
+    kernel = as_wide_as_spread(kernel, states)
     wide = kernel.with_lengthscales(WIDER * kernel.lengthscales)
     basis, features = RKHSBasis.fit(wide, states, tolerance=MAX_RESIDUAL, max_rank=MAX_CENTRES)
     gram = features.T @ features + RIDGE * len(states) * np.eye(features.shape[1])

@@ -167,5 +167,6 @@ def acceptance_test(rows: Sequence[Row]) -> Finding | None:
         REJECTED_NOTE,
         f"{rejected}: model rollouts do not confirm the gains that V predicts, and the previous "
         "policy was kept.",
-        f"nothing if the reward is good enough; otherwise more data for each update ({MORE_DATA}).",
+        "nothing if the reward is good enough, as it is where no episode ends early any more; "
+        f"otherwise more data for each update ({MORE_DATA}).",
     )
