@@ -27,6 +27,7 @@ import recorded_data  # noqa: E402
 import robot_time  # noqa: E402
 import stale_results  # noqa: E402
 import suite  # noqa: E402
+import suite_peers  # noqa: E402
 from fill_tables import filled  # noqa: E402
 
 PAGES = [*sorted(ROOT.glob("*.md")), *sorted((ROOT / "docs").rglob("*.md"))]
@@ -110,6 +111,9 @@ def test_tables_show_what_the_result_files_hold(page: Path) -> None:
         elif name in ("suite", "few-data"):
             writer = {"suite": suite, "few-data": few_data}[name]
             assert table == writer.table(content["results"])
+            assert "+" not in content["commit"]
+        elif name == "suite-peers":
+            assert table == suite_peers.table(content["runs"]).strip()
             assert "+" not in content["commit"]
         elif name == "peers-seconds":
             assert table == peers_seconds.table(content["rows"])
