@@ -380,11 +380,14 @@ def test_a_figure_is_written_as_csv_json_markdown_and_png(tmp_path: Path) -> Non
     assert all(path.stat().st_size > 0 for path in paths)
     assert commits_of(results) == "abc"
     assert len(rows_of(results)) == 6  # the grid needs one iteration only
-    chosen = search.tuned_options("swing-up", "value iteration on a grid (default)")
-    options = ", ".join(f"{name}={value!r}" for name, value in chosen.items())
-    grid = f"value iteration on a grid (default): {options}"
+
+    def named(method: str) -> str:
+        chosen = search.tuned_options("swing-up", method)
+        return ": ".join([method, ", ".join(f"{k}={v!r}" for k, v in chosen.items())])
+
+    grid = named("value iteration on a grid (default)")
     assert [list(column.curves) for column in columns_of("figure-1b", results)] == [
-        ["kernel REPS (paper)", grid],
+        [named("kernel REPS (paper)"), grid],
         [grid],
     ]
 
