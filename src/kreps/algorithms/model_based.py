@@ -3,9 +3,9 @@
 This is the idea of Dyna (Sutton 1990).  In a first step states are resampled by the weights of
 Algorithm 1, in the others they are visited in model rollouts of the policy of the step before.  In
 each state several actions are sampled around the policy's, and weighted by the same dual.  These
-steps go on while the model predicts a larger return, and the best policy is kept.  Steps by the
-gradient of that return follow on it.  It acts only if it passes an acceptance test against the
-previous one.
+steps go on while the model predicts a larger return, and the best policy is kept.  Where episodes
+end a linear-quadratic regulator of the model may take its place.  Steps by the gradient of that
+return follow on it.  It acts only if it passes an acceptance test against the previous one.
 
 While there is an exploration bonus, an explorer is optimised with it by bounded steps; a random
 policy takes its place if it is better.  It collects half of the next rollouts, and is neither
