@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.algorithms import model_based
+from kreps.algorithms import candidates
 from kreps.algorithms.acceptance import ModelComparison
 from kreps.algorithms.exact import ExactBatch
 from kreps.algorithms.generated import StateSource
@@ -251,7 +251,7 @@ def test_a_random_policy_explores_if_it_is_better_and_never_acts(
             return np.full(comparison.rollouts, gain * 1e6)
         return compare(comparison, policy)
 
-    monkeypatch.setattr(model_based, "best_random_policy", draw)
+    monkeypatch.setattr(candidates, "best_random_policy", draw)
     monkeypatch.setattr(ModelComparison, "returns", returns)
     learner, _ = updated(turns(), **{"model_based.gradient_steps": 0})
     assert len(drawn) == 1

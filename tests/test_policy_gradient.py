@@ -35,9 +35,9 @@ from kreps.models.model_env import ModelEnv
 from kreps.models.return_gradient import FixedNoise, action_gradient
 from kreps.models.reward_model import RewardModel
 from kreps.models.transition import state_actions, state_kernel
-from kreps.models.world_model import WorldModel
 from kreps.policies.cost_sensitive_gp import CostSensitiveGP
 from kreps.policies.sparse_gp import SparseGP
+from tests.compared import compared_in
 
 TASKS = {
     "plain": TaskSpec(2, np.array([-2.0]), np.array([2.0]), periodic=(0,)),
@@ -84,20 +84,7 @@ def comparison(name: str) -> ModelComparison:
         regression.predictor(targets), float(data.rewards.mean()), -0.5, -9.0, 9.0
     )
     env = ModelEnv(dynamics, data, kernel, task, 0.1, 0.0, 15, -2.0)
-    world = WorldModel(
-        task=task,
-        states=data.states,
-        features=np.empty((len(data), 0)),
-        phi=lambda states: np.empty((len(states), 0)),
-        restart=np.empty(0),
-        expected_features=lambda rows, inputs: np.empty((len(rows), 0)),
-        dynamics=dynamics,
-        terminations=None,
-        reward_model=reward_model,
-        model_env=env,
-        bonus=None,
-    )
-    return ModelComparison(world, 8, seed=3)
+    return compared_in(env, reward_model, 8, seed=3)
 
 
 def policy_of(name: str, noise: float = 0.01) -> CostSensitiveGP:

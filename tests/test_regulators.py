@@ -3,21 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-import pytest
 from scipy.linalg import solve_discrete_are
 
-import kreps
-from kreps.algorithms.acceptance import ModelComparison
-from kreps.algorithms.model_based import with_regulators
-from kreps.algorithms.policy_targets import PolicyFit
 from kreps.algorithms.regulators import (
+    MIN_DISTANCE,
     Linearisation,
     Regulator,
-    best_regulator,
     controllable,
     differences,
     equilibrium,
@@ -25,109 +19,30 @@ from kreps.algorithms.regulators import (
     regulators,
     spread,
 )
-from kreps.algorithms.state import Stopwatch
-from kreps.data.history import stacked
-from kreps.data.rollouts import Rollout, Rollouts
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.basis import KernelExpansion
-from kreps.kernels.kernel import Kernel, SquaredExponential
-from kreps.models.dynamics import fit_dynamics
-from kreps.models.model_env import ModelEnv
-from kreps.models.reward_model import RewardModel
-from kreps.models.transition import state_kernel
-from kreps.models.world_model import WorldModel
-from kreps.policies.cost_sensitive_gp import CostSensitiveGP
-
-TASK = TaskSpec(3, np.array([-2.0]), np.array([2.0]))
-"""A pole that falls: sine and cosine of its angle, and its speed in rad/s that a torque changes."""
-
-
-def pole(angle: float, speed: float, torque: float) -> tuple[float, float]:
-    speed = speed + 0.1 * (9.0 * np.sin(angle) + 4.0 * np.clip(torque, -2.0, 2.0))
-    return angle + 0.1 * speed, speed
-
-
-def observed(angle: float, speed: float) -> FloatArray:
-    return np.array([np.sin(angle), np.cos(angle), speed])
-
-
-def falls() -> list[Rollout]:
-    """The pole under random torques, from near the upright until it lies."""
-    rng, found = np.random.default_rng(0), []
-    for _ in range(25):
-        angle, speed = rng.normal(0.0, 0.1, 2)
-        states, torques = [observed(angle, speed)], rng.normal(0.0, 1.5, (12, 1))
-        for torque in torques[:, 0]:
-            angle, speed = pole(angle, speed, torque)
-            states.append(observed(angle, speed))
-            if abs(angle) > 1.0:
-                break
-        steps = len(states) - 1
-        terminated = bool(abs(angle) > 1.0)
-        found.append(Rollout(np.array(states), torques[:steps], np.ones(steps), terminated))
-    return found
-
-
-@pytest.fixture(scope="module")
-def compared() -> ModelComparison:
-    """The model of `falls`, with a reward of one until the pole lies."""
-    rng = np.random.default_rng(0)
-    data = stacked(Rollouts.from_list(falls()), TASK).transitions
-    kernel = state_kernel(data, TASK, rng)
-    dynamics, _, _ = fit_dynamics(data, kernel, TASK, None, rng)
-    constant = KernelExpansion(
-        Kernel((SquaredExponential((0,)),), np.ones(1)), np.zeros((1, 4)), np.zeros((1, 1))
-    )
-    env = ModelEnv(dynamics, data, kernel, TASK, 0.02, 0.0, 40, 0.0)
-    world = WorldModel(
-        task=TASK,
-        states=data.states,
-        features=np.empty((len(data), 0)),
-        phi=lambda states: np.empty((len(states), 0)),
-        restart=np.empty(0),
-        expected_features=lambda rows, inputs: np.empty((len(rows), 0)),
-        dynamics=dynamics,
-        terminations=None,
-        reward_model=RewardModel(constant, 1.0, 0.0, 0.0, 1.0),
-        model_env=env,
-        bonus=None,
-    )
-    return ModelComparison(world, 20, seed=3)
-
-
-def steps_upright(act: CostSensitiveGP | Regulator, limit: int = 300) -> float:
-    """Mean number of steps of the true pole, from five starts."""
-    lengths = []
-    for seed in range(5):
-        angle, speed = np.random.default_rng(seed).normal(0.0, 0.1, 2)
-        steps = 0
-        while abs(angle) <= 1.0 and steps < limit:
-            torque = act.act(observed(angle, speed)[None], np.zeros((1, 1)))[0, 0]
-            angle, speed = pole(angle, speed, torque)
-            steps += 1
-        lengths.append(steps)
-    return float(np.mean(lengths))
+from tests.pole import TASK, compared, observed, steps_upright
 
 
 def test_gains_are_those_of_the_riccati_equation() -> None:
     rng = np.random.default_rng(0)
     a, b = np.eye(3) + 0.3 * rng.normal(size=(3, 3)), rng.normal(size=(3, 2))
     for action_cost, p in ((0.01, 0.0), (0.5, 0.05)):
-        gains, offset = regulator_gains(Linearisation(a, b, np.zeros(3)), action_cost, p, 3)
+        gains, offset, found = regulator_gains(Linearisation(a, b, np.zeros(3)), action_cost, p, 3)
         # a discount scales both matrices by its root
         root = np.sqrt(1.0 - p)
         cost = solve_discrete_are(root * a, root * b, np.eye(3), action_cost * np.eye(2))
         price = action_cost * np.eye(2) + root**2 * b.T @ cost @ b
         wanted = -np.linalg.solve(price, root**2 * b.T @ cost @ a)
         np.testing.assert_allclose(gains, wanted, rtol=1e-4)
+        np.testing.assert_allclose(found, cost, rtol=1e-4)
         np.testing.assert_array_equal(offset, 0.0)
 
 
 def test_the_offset_counters_a_drift() -> None:
     """A wind of 0.3 per step on an integrator: the action that cancels it keeps the state."""
     model = Linearisation(np.eye(1), np.eye(1), np.array([0.3]))
-    gains, offset = regulator_gains(model, 0.01, 0.001, 1)
+    gains, offset, _ = regulator_gains(model, 0.01, 0.001, 1)
     x = np.zeros(1)
     for _ in range(50):
         x = x + gains @ x + offset + 0.3
@@ -138,13 +53,13 @@ def test_modes_that_the_action_does_not_move_are_left_out() -> None:
     """An unstable coordinate beside the one that is regulated: its gains would be huge."""
     a, b = np.diag([1.1, 1.5]), np.array([[1.0], [0.01]])
     np.testing.assert_allclose(controllable(Linearisation(a, b, np.zeros(2))), np.diag([1.0, 0.0]))
-    gains, _ = regulator_gains(Linearisation(a, b, np.zeros(2)), 0.01, 0.01, 2)
-    alone, _ = regulator_gains(Linearisation(a[:1, :1], b[:1], np.zeros(1)), 0.01, 0.01, 1)
+    gains, _, _ = regulator_gains(Linearisation(a, b, np.zeros(2)), 0.01, 0.01, 2)
+    alone, _, _ = regulator_gains(Linearisation(a[:1, :1], b[:1], np.zeros(1)), 0.01, 0.01, 1)
     np.testing.assert_allclose(gains, [[alone[0, 0], 0.0]], atol=1e-12)
 
 
-def test_equilibria_are_found_from_falling_states(compared: ModelComparison) -> None:
-    world, env = compared.world, compared.from_starts
+def test_equilibria_are_found_from_falling_states() -> None:
+    world, env = compared().world, compared().from_starts
     scale = world.states.std(axis=0)
     state, action = equilibrium(world, env, observed(0.3, 0.5), scale)
     # upright at rest, or leaning against a torque: 9 sin(angle) + 4 torque = 0
@@ -159,53 +74,15 @@ def test_differences_of_angles_are_wrapped() -> None:
     np.testing.assert_allclose(found, [[6.0 - 2.0 * np.pi, 6.0, 1.0]])
 
 
-def test_the_best_regulator_keeps_the_pole_upright(compared: ModelComparison) -> None:
-    """Random torques keep it up for about ten steps, and no sample is of a longer rollout."""
-    world, env = compared.world, compared.from_starts
-    states = world.states[::5]
-    none = np.zeros((len(states), 1))
-    policy = CostSensitiveGP(TASK, env.kernel, states, none, np.ones(len(states)), 1.0, 0.25)
-    assert steps_upright(policy) < 15
-    assert max(map(steps_upright, regulators(world, env, 2))) == 300
-    found = best_regulator(compared, policy.predictor, env.kernel, 2)
-    assert found is not None
-    assert steps_upright(found) == 300  # type: ignore[arg-type]
-    np.testing.assert_allclose(found.standard_deviation(states), 0.01 * 2.0, rtol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("ends", "count", "taken"), [(True, 2, True), (False, 2, False), (True, 0, False)]
-)
-def test_regulators_are_candidates_where_episodes_end(
-    compared: ModelComparison, ends: bool, count: int, taken: bool
-) -> None:
-    world, env = compared.world, compared.from_starts
-    states = world.states[::5]
-    none, one = np.zeros((len(states), 1)), np.ones(len(states))
-    policy = CostSensitiveGP(TASK, env.kernel, states, none, one, 1.0, 0.25)
-    batch: Any = SimpleNamespace(
-        settings=SimpleNamespace(model_based=kreps.ModelBased(regulators=count)), clock=Stopwatch()
-    )
-    step: Any = Generated(PolicyFit(policy, np.zeros(1), len(states), 0.25))
-    before = compared.returns(policy)
-    case = replace(compared, has_ends=ends)
-    found, returns = with_regulators(batch, step, before, case, env.kernel)
-    assert (found is not step) is taken
-    np.testing.assert_array_equal(returns, case.returns(found.policy.policy))
-    if taken:
-        assert returns.mean() > before.mean()
-        assert found.policy.noise == pytest.approx(1e-4)
-        # one that is already there is not given up for one that is worse
-        hopeless = returns + 1.0
-        again, kept = with_regulators(batch, found, hopeless, case, env.kernel)
-        assert again is found and kept is hopeless
-
-
-@dataclass(frozen=True)
-class Generated:
-    """Of a generated step what `with_regulators` changes."""
-
-    policy: PolicyFit
+def test_a_regulator_keeps_the_pole_upright() -> None:
+    world, env = compared().world, compared().from_starts
+    found = regulators(world, env, 4)
+    assert max(map(steps_upright, found)) == 300
+    # two action costs for each equilibrium, and none twice
+    kept = np.array([each.state for each in found[::2]]) / spread(world.states, TASK)
+    np.testing.assert_array_equal(found[0].state, found[1].state)
+    apart = np.mean((kept[:, None] - kept) ** 2, axis=2) + np.eye(len(kept))
+    assert 2 * len(kept) == len(found) and len(kept) < 4 and apart.min() > MIN_DISTANCE
 
 
 def test_a_chain_of_delayed_actions_is_regulated() -> None:
@@ -213,7 +90,7 @@ def test_a_chain_of_delayed_actions_is_regulated() -> None:
     a = np.array([[1.0, 0.0, 0.5], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     model = Linearisation(a, np.array([[0.0], [1.0], [0.0]]), np.zeros(3))
     np.testing.assert_array_equal(controllable(model), np.eye(3))
-    gains, offset = regulator_gains(model, 0.01, 0.0, 1)
+    gains, offset, _ = regulator_gains(model, 0.01, 0.0, 1)
     x = np.array([1.0, 0.0, 0.0])
     for _ in range(12):
         x = a @ x + model.control[:, 0] * (gains @ x + offset)[0]
@@ -226,12 +103,28 @@ def test_constant_coordinates_and_angles_have_a_scale() -> None:
     states = np.stack([np.linspace(0.0, 1.0, 100), np.full(100, 0.1), angles], axis=1)
     found = spread(states, task)
     np.testing.assert_allclose(found, [states[:, 0].std(), 1.0, np.sin(np.pi - 3.1)], rtol=1e-6)
-    regulator = Regulator(task, np.array([0.0, 0.0, 3.1]), np.zeros(1), np.array([[0.0, 0.0, 2.0]]))
+    upside_down, gains = np.array([0.0, 0.0, 3.1]), np.array([[0.0, 0.0, 2.0]])
+    regulator = Regulator(task, upside_down, np.zeros(1), gains, np.diag([1.0, 2.0, 4.0]))
     turned = regulator.scaled(np.array([[0.0, 0.0, 3.1], [0.0, 0.0, 3.2 - 2.0 * np.pi]]))
     np.testing.assert_allclose(turned, [[0.0], [2.0 * np.sin(0.1)]], atol=1e-12)
+    around = np.array([[3.0, 1.0, 3.1], [0.0, 0.0, 3.2 - 2.0 * np.pi], [0.0, 0.0, 1.5]])
+    wanted = [9.0 + 2.0, 4.0 * np.sin(0.1) ** 2, np.inf]  # the last one is beyond a quarter turn
+    np.testing.assert_allclose(regulator.costs(around), wanted, rtol=1e-12)
 
 
-def test_derivatives_that_are_not_finite_give_no_regulator(compared: ModelComparison) -> None:
+def test_feedback_stays_within_the_limits_up_to_a_cost() -> None:
+    """In the ellipsoid of that cost the largest feedback is one."""
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    regulator = Regulator(TASK, np.zeros(3), np.zeros(1), rng.normal(size=(1, 3)), root.T @ root)
+    sphere = rng.normal(size=(20_000, 3))
+    sphere *= np.sqrt(regulator.cost_within_limits) / np.linalg.norm(sphere, axis=1)[:, None]
+    states = np.linalg.solve(root, sphere.T).T
+    np.testing.assert_allclose(regulator.costs(states), regulator.cost_within_limits, rtol=1e-9)
+    np.testing.assert_allclose(np.abs(regulator.scaled(states)).max(), 1.0, rtol=1e-3)
+
+
+def test_derivatives_that_are_not_finite_give_no_regulator() -> None:
     @dataclass(frozen=True)
     class Broken:
         """Dynamics whose derivatives overflow."""
@@ -243,4 +136,4 @@ def test_derivatives_that_are_not_finite_give_no_regulator(compared: ModelCompar
             return inputs[:, :3], np.zeros(len(inputs))
 
     broken: Any = Broken()
-    assert regulators(replace(compared.world, dynamics=broken), compared.from_starts, 3) == []
+    assert regulators(replace(compared().world, dynamics=broken), compared().from_starts, 3) == []

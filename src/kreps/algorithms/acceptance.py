@@ -78,8 +78,13 @@ def standard_error(gain: FloatArray) -> float:
     return float(gain.std(ddof=1) / np.sqrt(len(gain)))
 
 
+def is_worse(gain: FloatArray) -> bool:
+    """Whether the mean of the differences (n,) is below zero by more than its standard error."""
+    return not gain.mean() >= -standard_error(gain)
+
+
 def is_rejected(gain: FloatArray, has_ends: bool) -> bool:
-    """Whether the new policy is worse than the previous one by a standard error.
+    """Whether the new policy is worse than the previous one.
 
     Where episodes end, whether it is no better: policies that keep all episodes going have equal
     returns in the model, and one that has stood the test in truth is not given up for another.
@@ -88,8 +93,7 @@ def is_rejected(gain: FloatArray, has_ends: bool) -> bool:
         gain: (rollouts,) returns of the new policy relative to the previous one.
         has_ends: whether episodes end.
     """
-    smallest = 0.0 if has_ends else -standard_error(gain)
-    return not (gain.mean() > smallest if has_ends else gain.mean() >= smallest)
+    return not gain.mean() > 0.0 if has_ends else is_worse(gain)
 
 
 def compare_in_model(

@@ -27,23 +27,22 @@ from kreps.algorithms.acceptance import (
     proposal_std_scale,
     standard_error,
 )
+from kreps.algorithms.candidates import (
+    with_gradient_steps,
+    with_random_policies,
+    with_regulators,
+)
 from kreps.algorithms.dual import DualSolution
 from kreps.algorithms.ends import AbsorbingEnd, solve_with_end
 from kreps.algorithms.generated import GeneratedSamples, StateSource, generate, split_budget
-from kreps.algorithms.policy_gradient import improve
 from kreps.algorithms.policy_targets import PolicyFit, PolicyTargets
-from kreps.algorithms.random_policies import best_random_policy
-from kreps.algorithms.regulators import best_regulator
 from kreps.algorithms.reps import Batch, Step, stationarity_ridge
 from kreps.algorithms.state import LearnerState
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.kernel import Kernel
 from kreps.models.model_env import ModelEnv, supports_model_rollouts
 from kreps.models.novelty import novelty_bonus
 from kreps.models.world_model import WorldModel
 from kreps.policies.base import LearntPolicy
-from kreps.policies.cost_sensitive_gp import CostSensitiveGP
-from kreps.policies.sparse_gp import SparseGP
 
 PATIENCE = 3
 """Steps in a row without a gain of one standard error in the model, after which there is none."""
@@ -139,10 +138,14 @@ def model_based_step(
     has_ends = state.terminated or bool(batch.data.terminated.any())
     comparison = compare_in_model(world, model_based.acceptance_rollouts, seed, has_ends)
     best, returns = optimise(batch, world, step, comparison, rng)
-    if comparison is not None and returns is not None:
-        best, returns = with_regulators(batch, best, returns, comparison, step.kernel)
-        best, returns = with_gradient_steps(batch, best, returns, comparison)
     rejected = None
+    if comparison is not None and returns is not None:
+        count = model_based.regulators
+        fit, returns = with_regulators(best.policy, returns, comparison, step.kernel, count)
+        batch.clock.lap("regulators")
+        fit, returns = with_gradient_steps(fit, returns, comparison, model_based.gradient_steps)
+        batch.clock.lap("policy gradient")
+        best = replace(best, policy=fit)
     if comparison is not None and returns is not None and state.policy is not None:
         gain = returns - comparison.returns(state.policy)
         rejected = is_rejected(gain, comparison.has_ends)
@@ -151,9 +154,12 @@ def model_based_step(
     if optimistic.bonus is not None:
         comparison = compare_in_model(optimistic, model_based.acceptance_rollouts, seed)
         found, returns = optimise(batch, optimistic, step, comparison, rng)
+        fit = found.policy
         if comparison is not None and returns is not None:
-            found, _ = with_random_policies(batch, found, returns, comparison, rng)
-        explorer = found.policy.policy
+            count = model_based.random_policies
+            fit, _ = with_random_policies(fit, returns, comparison, count, rng)
+            batch.clock.lap("random policies")
+        explorer = fit.policy
     step = replace(step, dual=best.dual, policy=best.policy, reward_model=world.reward_model)
     return ModelBasedResult(step, reward_start, rejected, explorer)
 
@@ -203,104 +209,6 @@ def optimise(
         if without_gain == PATIENCE:
             break
     return best, returns
-
-
-def with_random_policies(
-    batch: Batch[Any, Any],
-    best: GeneratedStep,
-    returns: FloatArray,
-    comparison: ModelComparison,
-    rng: np.random.Generator,
-) -> tuple[GeneratedStep, FloatArray]:
-    """A random policy in place of that of a step, if its returns (rollouts,) are larger."""
-    model_based = batch.settings.model_based
-    assert model_based is not None
-    if not model_based.random_policies:
-        return best, returns
-    policy = on_its_centres(best.policy.policy)
-    drawn = best_random_policy(comparison, policy, model_based.random_policies, rng)
-    found = better_of(best, returns, drawn, comparison)
-    batch.clock.lap("random policies")
-    return found
-
-
-def with_regulators(
-    batch: Batch[Any, Any],
-    best: GeneratedStep,
-    returns: FloatArray,
-    comparison: ModelComparison,
-    kernel: Kernel,
-) -> tuple[GeneratedStep, FloatArray]:
-    """Where episodes end, a regulator in the policy's place, unless a standard error worse.
-
-    If both keep an episode going for a whole rollout, the regulator is more likely to do so for
-    longer.  Where no episode ends, regulators exploit errors of the model far from the equilibrium.
-
-    ``kernel`` is that over states, at median lengthscales.
-    """
-    model_based = batch.settings.model_based
-    assert model_based is not None
-    if not model_based.regulators or not comparison.has_ends:
-        return best, returns
-    policy = on_its_centres(best.policy.policy)
-    regulator = best_regulator(comparison, policy, kernel, model_based.regulators)
-    if regulator is not None:
-        new_returns = comparison.returns(regulator)
-        if not is_rejected(new_returns - returns, False):
-            fit = replace(
-                best.policy,
-                policy=regulator,
-                support=len(regulator.states),
-                noise=regulator.noise,
-            )
-            best, returns = replace(best, policy=fit), new_returns
-    batch.clock.lap("regulators")
-    return best, returns
-
-
-def with_gradient_steps(
-    batch: Batch[Any, Any],
-    best: GeneratedStep,
-    returns: FloatArray,
-    comparison: ModelComparison,
-) -> tuple[GeneratedStep, FloatArray]:
-    """The policy of a step after gradient ascent, if its returns (rollouts,) are larger.
-
-    They are compared on other starts and noise than those of the ascent.
-    """
-    model_based = batch.settings.model_based
-    assert model_based is not None
-    if not model_based.gradient_steps:
-        return best, returns
-    improved = improve(comparison, on_its_centres(best.policy.policy), model_based.gradient_steps)
-    found = better_of(best, returns, improved, comparison)
-    batch.clock.lap("policy gradient")
-    return found
-
-
-def better_of(
-    best: GeneratedStep, returns: FloatArray, policy: SparseGP, comparison: ModelComparison
-) -> tuple[GeneratedStep, FloatArray]:
-    """A step with its returns (rollouts,), or with another policy if this has a larger mean."""
-    new_returns = comparison.returns(policy)
-    if new_returns.mean() <= returns.mean():
-        return best, returns
-    return replace(best, policy=replace(best.policy, policy=policy)), new_returns
-
-
-def on_its_centres(policy: LearntPolicy) -> SparseGP:
-    """A policy on the centres that it is evaluated with.
-
-    Its arrays are as they are read from a file, so that it rounds alike.
-    """
-    assert isinstance(policy, CostSensitiveGP | SparseGP)
-    policy = policy.predictor if isinstance(policy, CostSensitiveGP) else policy
-    return replace(
-        policy,
-        states=np.ascontiguousarray(policy.states),
-        mean_weights=np.ascontiguousarray(policy.mean_weights),
-        explained=np.ascontiguousarray(policy.explained),
-    )
 
 
 def generated_step(

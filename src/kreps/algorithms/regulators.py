@@ -1,36 +1,26 @@
-"""Linear-quadratic regulators in the model as candidates for the policy, which the paper has not.
+"""Linear-quadratic regulators of the learnt model, which the paper has not.
 
-Bounded steps and the gradient improve a policy by small changes.  Where the dynamics are unstable
-their results stay far behind what the model allows: from 330 steps of a double pendulum they keep
-it up for 20 steps, and the feedback that is optimal for the linearised model for 200 or more.
-
-So where episodes end the model is linearised in equilibria near a start state and the samples of
-the largest reward, and the linear-quadratic regulator of each, which keeps the state there, is a
-candidate.  The best of them takes the place of the policy unless it is worse in the model.
+The model is linearised in equilibria near a start state and the samples of the largest reward, and
+the linear-quadratic regulator of each is the linear feedback that keeps the state there.  Policies
+are made of them in `kreps.algorithms.regulated_policies`.
 
 Deviations of the state are in standard deviations of the samples, and a regulator minimises the sum
-of their squares and of a multiple of the squared scaled action.  The reward decides only which
-states are kept and how regulators compare, as its curvature is often unknown (a reward for being
-alive has none).
+of their squares and of a multiple of the squared scaled action.  The reward decides only near which
+states there are regulators, as its curvature is often unknown (a reward for being alive has none).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
-from kreps.algorithms.acceptance import ModelComparison
-from kreps.algorithms.policy_targets import MIN_ACTION_VARIANCE
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
-from kreps.kernels.basis import RKHSBasis
-from kreps.kernels.kernel import Kernel, as_wide_as_spread
-from kreps.kernels.linalg import solve_lower_transposed
 from kreps.models.dynamics import CONSTANT_RTOL
 from kreps.models.model_env import ModelEnv
 from kreps.models.world_model import WorldModel
-from kreps.policies.sparse_gp import SparseGP
 
 ACTION_COSTS = (0.01, 0.3)
 """Prices of the squared scaled action, relative to that of the squared deviation of a coordinate.
@@ -58,19 +48,12 @@ MAX_RICCATI_STEPS, RICCATI_RTOL, MAX_COST = 300, 1e-6, 1e12
 """Riccati recursions at most, the relative change after which there is no further one, and the cost
 at which the recursion diverges."""
 
-WIDER, MAX_CENTRES, MAX_RESIDUAL = 3.0, 300, 1e-10
-"""The policy that is fitted to a regulator: its lengthscales in spreads of the samples, the number
-of its centres, and the squared residual of the kernel at which these are enough.  A linear function
-needs long lengthscales."""
+COST_JITTER = 1e-6
+"""Added to the diagonal of P, scaled to one, before it is inverted: there is no cost of modes that
+are left out."""
 
 TINY = 1e-100
-"""Smallest variance of samples around a state."""
-
-NO_SIGNAL = 1e-12
-"""Signal variance of that policy: its standard deviation is that of the noise everywhere."""
-
-RIDGE = 1e-9
-"""Of that fit, for features of norm one."""
+"""Smallest variance of samples around a state, and smallest cost of a deviation."""
 
 
 @dataclass(frozen=True)
@@ -97,20 +80,49 @@ class Regulator:
         state: (ds,) the equilibrium.
         action: (da,) scaled, there.
         gains: (da, ds) of deviations in units of the state.
+        cost: (ds, ds) P; the linearised model expects the cost ``d' P d`` of a deviation d.
     """
 
     task: TaskSpec
     state: FloatArray
     action: FloatArray
     gains: FloatArray
+    cost: FloatArray
 
     def scaled(self, states: FloatArray) -> FloatArray:
         """Scaled actions (m, da) around the centre, at states (m, ds); they are not limited."""
-        deviation = differences(states, self.state, self.task)
-        angles = list(self.task.periodic)
-        deviation[:, angles] = np.sin(deviation[:, angles])
-        actions: FloatArray = self.action + deviation @ self.gains.T
+        actions: FloatArray = self.action + self.deviations(states) @ self.gains.T
         return actions
+
+    def deviations(self, states: FloatArray) -> FloatArray:
+        """Of states (m, ds) from the equilibrium; the sine of that of an angle."""
+        deviations = differences(states, self.state, self.task)
+        angles = list(self.task.periodic)
+        deviations[:, angles] = np.sin(deviations[:, angles])
+        return deviations
+
+    def costs(self, states: FloatArray) -> FloatArray:
+        """Expected costs (m,) of the way from states (m, ds) to the equilibrium.
+
+        Infinite where an angle is more than a quarter of a turn away.
+        """
+        angles = list(self.task.periodic)
+        far = np.abs(differences(states, self.state, self.task)[:, angles]) > 0.5 * np.pi
+        deviations = self.deviations(states)
+        costs = np.einsum("ij,jk,ik->i", deviations, self.cost, deviations)
+        return np.where(far.any(axis=1), np.inf, costs)
+
+    @cached_property
+    def cost_within_limits(self) -> float:
+        """Largest cost such that feedback in no state of it exceeds a scaled action of one.
+
+        In the ellipsoid ``d' P d <= c`` the largest feedback ``k' d`` is ``sqrt(c k' P^-1 k)``.
+        """
+        unit = np.sqrt(np.maximum(np.diag(self.cost), TINY))
+        cost = self.cost / np.outer(unit, unit) + COST_JITTER * np.eye(len(unit))
+        gains = self.gains / unit
+        largest = np.max(np.sum(gains.T * np.linalg.solve(cost, gains.T), axis=0))
+        return 1.0 / max(float(largest), TINY)
 
     def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
         """Actions (m, da) without noise."""
@@ -178,7 +190,7 @@ def controllable(model: Linearisation) -> FloatArray:
 
 def regulator_gains(
     model: Linearisation, action_cost: float, restart_probability: float, observed: int
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Gains (da, ds) and an offset (da,) of the action, which counter deviations and the drift.
 
     Args:
@@ -187,6 +199,9 @@ def regulator_gains(
         restart_probability: p; with it the process restarts, so that later costs count less.
         observed: number of coordinates, the first ones, whose deviations have a cost.  Earlier
             changes and actions in the state have none.
+
+    Returns:
+        The gains, the offset, and the expected cost (ds, ds) as a quadratic form.
     """
     size, width = model.control.shape
     projection = controllable(model)
@@ -207,7 +222,7 @@ def regulator_gains(
         largest = float(np.abs(cost).max())
         if not largest < MAX_COST or np.abs(cost - before).max() < RICCATI_RTOL * largest:
             break
-    return gains[:, :size], gains[:, size]
+    return gains[:, :size], gains[:, size], cost[:size, :size]
 
 
 def regulators(world: WorldModel, model_env: ModelEnv, count: int) -> list[Regulator]:
@@ -216,9 +231,13 @@ def regulators(world: WorldModel, model_env: ModelEnv, count: int) -> list[Regul
     Args:
         world: the learnt model.
         model_env: of the same samples.
-        count: number of equilibria.
+        count: largest number of equilibria; close to another one there is none.
     """
     scale = spread(world.states, world.task)
+
+    def distances(states: FloatArray, state: FloatArray) -> FloatArray:
+        return np.mean((differences(states, state, world.task) / scale) ** 2, axis=1)
+
     size, width = len(world.states), world.task.action_size
     inputs = np.concatenate([world.states, np.zeros((size, width))], axis=1)
     rewards = world.reward_model(inputs, np.zeros(size))
@@ -228,10 +247,12 @@ def regulators(world: WorldModel, model_env: ModelEnv, count: int) -> list[Regul
     for number in range(count):
         if number:
             sample = world.states[np.argmax(np.where(apart, rewards, -np.inf))]
-        distance = np.mean((differences(world.states, sample, world.task) / scale) ** 2, axis=1)
-        apart &= distance > MIN_DISTANCE
+        apart &= distances(world.states, sample) > MIN_DISTANCE
         try:
-            found += regulators_at(world, model_env, sample, scale)
+            state, action = equilibrium(world, model_env, sample, scale)
+            others = np.array([each.state for each in found]).reshape(-1, len(state))
+            if (distances(others, state) > MIN_DISTANCE).all():
+                found += regulators_at(world, model_env, state, action, scale)
         except np.linalg.LinAlgError:  # derivatives of the model that are not finite
             continue
         if not apart.any():
@@ -240,20 +261,26 @@ def regulators(world: WorldModel, model_env: ModelEnv, count: int) -> list[Regul
 
 
 def regulators_at(
-    world: WorldModel, model_env: ModelEnv, sample: FloatArray, scale: FloatArray
+    world: WorldModel,
+    model_env: ModelEnv,
+    state: FloatArray,
+    action: FloatArray,
+    scale: FloatArray,
 ) -> list[Regulator]:
-    """Regulators of the equilibrium near a sample (ds,), for each of the action costs.
+    """Regulators of an equilibrium (ds,) with a scaled action (da,), one for each action cost.
 
     Raises:
         LinAlgError: the derivatives of the model are not finite.
     """
-    state, action = equilibrium(world, model_env, sample, scale)
     model, found = linearised(world, state, action, scale), []
     p, observed = model_env.restart_probability, world.task.observation_size
     for action_cost in ACTION_COSTS:
-        gains, offset = regulator_gains(model, action_cost, p, observed)
-        regulator = Regulator(world.task, state, action + offset, gains / scale)
-        if all(np.isfinite(each).all() for each in (state, regulator.action, regulator.gains)):
+        gains, offset, cost = regulator_gains(model, action_cost, p, observed)
+        regulator = Regulator(
+            world.task, state, action + offset, gains / scale, cost / np.outer(scale, scale)
+        )
+        numbers = (state, regulator.action, regulator.gains, regulator.cost)
+        if all(np.isfinite(each).all() for each in numbers):
             found.append(regulator)
     return found
 
@@ -268,51 +295,3 @@ def spread(states: FloatArray, task: TaskSpec) -> FloatArray:
     found[angles] = turns.std(axis=0)
     constant = found <= CONSTANT_RTOL * np.abs(states).max(axis=0)
     return np.where(constant, 1.0, found)
-
-
-def best_regulator(
-    comparison: ModelComparison, policy: SparseGP, kernel: Kernel, count: int
-) -> SparseGP | None:
-    """The regulator with the largest return in the model, as a policy with the least noise.
-
-    Args:
-        comparison: of policies in the model.
-        policy: that has the arrays of a policy.
-        kernel: over states, at median lengthscales.
-        count: number of equilibria.
-
-    Returns:
-        None if there is no finite regulator.
-    """
-    found = regulators(comparison.world, comparison.from_starts, count)
-    if not found:
-        return None
-    best = max(found, key=lambda each: float(comparison.returns(each).mean()))
-    return fitted(best, policy, kernel, comparison.world.states)
-
-
-def fitted(regulator: Regulator, policy: SparseGP, kernel: Kernel, states: FloatArray) -> SparseGP:
-    """A regulator as a policy with long lengthscales, and with the least exploration noise.
-
-    A policy that keeps an unstable state has to act precisely; the explorer is there to explore.
-
-    Args:
-        regulator: that the mean is fitted to at the states.
-        policy: that all but kernel, centres, mean and variances are taken from.
-        kernel: over states, at median lengthscales.
-        states: (n, ds), among which its centres are.
-    """
-    kernel = as_wide_as_spread(kernel, states)
-    wide = kernel.with_lengthscales(WIDER * kernel.lengthscales)
-    basis, features = RKHSBasis.fit(wide, states, tolerance=MAX_RESIDUAL, max_rank=MAX_CENTRES)
-    gram = features.T @ features + RIDGE * len(states) * np.eye(features.shape[1])
-    theta = np.linalg.solve(gram, features.T @ regulator.scaled(states))
-    return replace(
-        policy,
-        kernel=wide,
-        states=np.ascontiguousarray(basis.pivots),
-        mean_weights=np.ascontiguousarray(solve_lower_transposed(basis.lower, theta)),
-        explained=np.zeros_like(basis.lower),
-        signal=NO_SIGNAL,
-        noise=MIN_ACTION_VARIANCE,
-    )
