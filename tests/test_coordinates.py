@@ -11,8 +11,17 @@ import pytest
 from kreps.data.rollouts import Rollout, Transitions
 from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray
-from kreps.models.coordinates import CoordinateRegressions, fit_coordinates
-from kreps.models.transition import fit_regression, state_actions, state_kernel
+from kreps.models.coordinates import (
+    CoordinateRegressions,
+    fit_coordinates,
+    wide_hyperparameters,
+)
+from kreps.models.transition import (
+    embedding_hyperparameters,
+    fit_regression,
+    state_actions,
+    state_kernel,
+)
 
 TASK = TaskSpec(3, np.array([-1.0]), np.array([1.0]))
 
@@ -145,3 +154,17 @@ def test_narrow_kernels_predict_the_same() -> None:
         wanted = part(inputs + 1e-3)
         assert np.abs(wanted).max() > 1e-3
         np.testing.assert_allclose(found[:, columns], wanted, rtol=1e-7, atol=1e-11)
+
+
+def test_lengthscales_are_searched_around_the_spread_of_the_actions() -> None:
+    """A policy that holds a state: most actions hardly differ, and a twentieth are at a limit."""
+    data, rng = samples(), np.random.default_rng(2)
+    held = np.where(np.arange(len(data)) % 20 == 0, 1.0, 1e-3 * rng.normal(size=len(data)))
+    inputs = np.concatenate([data.states, held[:, None]], axis=1)
+    kernel = state_kernel(data, TASK, rng)
+    noise = rng.normal(size=(len(data), 1))
+    arguments = (inputs, noise, kernel, TASK, None)
+    wide, _, _ = wide_hyperparameters(*arguments, np.random.default_rng(1))
+    median, _, _ = embedding_hyperparameters(*arguments, np.random.default_rng(1))
+    assert median.lengthscales[-1] < 0.02  # a tenth of the spread
+    assert wide.lengthscales[-1] > 0.1

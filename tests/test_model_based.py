@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import kreps
-from kreps.algorithms import candidates
+from kreps.algorithms import candidates, model_based
 from kreps.algorithms.acceptance import ModelComparison
 from kreps.algorithms.exact import ExactBatch
 from kreps.algorithms.generated import StateSource
@@ -257,6 +257,23 @@ def test_a_random_policy_explores_if_it_is_better_and_never_acts(
     assert len(drawn) == 1
     assert (learner.state.explorer is drawn[0]) == (gain > 0.0)
     assert learner.state.policy is not drawn[0]
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_where_episodes_end_a_policy_has_to_reach_what_the_previous_one_earned(
+    ends: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Better in the model is not enough then."""
+    monkeypatch.setattr(model_based, "is_rejected", lambda gain, has_ends: False)
+    rollouts = [replace(each, terminated=ends) for each in turns()]
+    parts = ("random_policies", "improvement_steps", "regulators", "gradient_steps")
+    quick = {f"model_based.{part}": 0 for part in parts}
+    for real, rejected in ((None, False), (1e6, ends), (-1e6, False)):
+        monkeypatch.setattr(model_based, "real_return", lambda *arguments, real=real: real)
+        learner, first = updated(rollouts, **quick)
+        assert first.rejected is None
+        second = learner.update(rollouts)
+        assert isinstance(second, UpdateInfo) and second.rejected is rejected
 
 
 @exact_and_low_rank

@@ -128,10 +128,11 @@ class ModelBased(Checked):
         random_policies: number of random linear policies of an update, the best of which explores
             if its return in the model, with the bonus, is larger than that of the policy optimised
             with it; 0 for none.  There are none without an acceptance test.
-        regulators: where episodes end, number of equilibria near a start state and the samples with
-            the largest rewards.  The best linear-quadratic regulator of them in the model takes the
-            place of the best policy unless it is worse by a standard error; 0 for none.  There are
-            none without an acceptance test.
+        regulators: largest number of equilibria near a start state and the samples with the largest
+            rewards, in which the model is linearised; 0 for none.  A linear-quadratic regulator
+            acts in place of the best policy near its equilibrium if that is better in the model,
+            and where episodes end in all states unless it is worse by a standard error.  There
+            are none without an acceptance test.
         gradient_steps: largest number of steps by the gradient of the return in model rollouts,
             from the best policy on; 0 for none.  There are none without an acceptance test.
         max_samples: largest number of generated actions of an update.

@@ -51,6 +51,7 @@ from kreps.kernels.basis import Basis, RBFGrid, RKHSBasis
 from kreps.kernels.kernel import Kernel, as_wide_as_spread
 from kreps.kernels.regression import FeatureRegression, LeaveOneOut, RegressionSums
 from kreps.kernels.sampling import uniform_subsample
+from kreps.models.coordinates import wide_hyperparameters
 from kreps.models.dynamics import (
     DeltaStateTargets,
     Dynamics,
@@ -272,10 +273,10 @@ class LowRankBatch:
                 its sums.
             kernel, start, rng: as of `transition_model`.
         """
+        dynamics = self.settings.model == "dynamics"
+        hyperparameters = wide_hyperparameters if dynamics else embedding_hyperparameters
         inputs = state_actions(self.data, self.task)
-        fitted, regulariser, x = embedding_hyperparameters(
-            inputs, targets, kernel, self.task, start, rng
-        )
+        fitted, regulariser, x = hyperparameters(inputs, targets, kernel, self.task, start, rng)
         self.clock.lap("embedding fit")
         basis = self._centres(fitted, inputs, self.low_rank.rank)
         sums = reduce(add, self.compute.map(sums_in(basis), self.dataset.chunks))

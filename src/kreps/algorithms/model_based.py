@@ -3,9 +3,10 @@
 This is the idea of Dyna (Sutton 1990).  In a first step states are resampled by the weights of
 Algorithm 1, in the others they are visited in model rollouts of the policy of the step before.  In
 each state several actions are sampled around the policy's, and weighted by the same dual.  These
-steps go on while the model predicts a larger return, and the best policy is kept.  Where episodes
-end a linear-quadratic regulator of the model may take its place.  Steps by the gradient of that
-return follow on it.  It acts only if it passes an acceptance test against the previous one.
+steps go on while the model predicts a larger return, and the best policy is kept.  A
+linear-quadratic regulator of the model may take its place near an equilibrium, and steps by the
+gradient of that return follow (`kreps.algorithms.candidates`).  The result acts only if it passes
+an acceptance test against the previous policy.
 
 While there is an exploration bonus, an explorer is optimised with it by bounded steps; a random
 policy takes its place if it is better.  It collects half of the next rollouts, and is neither
@@ -24,6 +25,7 @@ from kreps.algorithms.acceptance import (
     ModelComparison,
     compare_in_model,
     is_rejected,
+    is_worse,
     proposal_std_scale,
     standard_error,
 )
@@ -36,6 +38,7 @@ from kreps.algorithms.dual import DualSolution
 from kreps.algorithms.ends import AbsorbingEnd, solve_with_end
 from kreps.algorithms.generated import GeneratedSamples, StateSource, generate, split_budget
 from kreps.algorithms.policy_targets import PolicyFit, PolicyTargets
+from kreps.algorithms.real_returns import real_return
 from kreps.algorithms.reps import Batch, Step, stationarity_ridge
 from kreps.algorithms.state import LearnerState
 from kreps.kernels.arrays import FloatArray
@@ -43,6 +46,10 @@ from kreps.models.model_env import ModelEnv, supports_model_rollouts
 from kreps.models.novelty import novelty_bonus
 from kreps.models.world_model import WorldModel
 from kreps.policies.base import LearntPolicy
+
+REAL_RETURN_TOLERANCE = 0.02
+"""By how much the return of a policy in the model may be below that of the previous one in truth,
+in standard deviations of the reward: predictions are no more accurate than that."""
 
 PATIENCE = 3
 """Steps in a row without a gain of one standard error in the model, after which there is none."""
@@ -149,6 +156,9 @@ def model_based_step(
     if comparison is not None and returns is not None and state.policy is not None:
         gain = returns - comparison.returns(state.policy)
         rejected = is_rejected(gain, comparison.has_ends)
+        if comparison.has_ends and not rejected:
+            real = real_return(batch, state.policy, comparison.from_starts.end_reward)
+            rejected = real is not None and is_worse(returns - real + REAL_RETURN_TOLERANCE)
         batch.clock.lap("acceptance test")
     explorer = None
     if optimistic.bonus is not None:

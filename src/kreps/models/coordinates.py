@@ -9,7 +9,7 @@ which is the one that can be predicted least.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -20,9 +20,10 @@ from kreps.data.task import TaskSpec
 from kreps.kernels.arrays import FloatArray, default_errstate
 from kreps.kernels.basis import KernelExpansion, moments_of_centres, slopes_by_coordinates
 from kreps.kernels.gram import BLOCK_ENTRIES
-from kreps.kernels.kernel import Kernel
+from kreps.kernels.kernel import Kernel, as_wide_as_spread
 from kreps.kernels.regression import embedding_of
-from kreps.models.transition import embedding_hyperparameters, fit_regression, state_actions
+from kreps.models.transition import LOG_LENGTHSCALE_STD as SHARED_LOG_LENGTHSCALE_STD
+from kreps.models.transition import HyperparameterFit, state_actions
 
 LOG_LENGTHSCALE_STD = 2.0
 """Prior standard deviation of a log lengthscale of one coordinate.  It is twice that of all
@@ -168,6 +169,37 @@ class _Part:
         return slopes
 
 
+def wide_hyperparameters(
+    inputs: FloatArray,
+    targets: FloatArray,
+    state_kernel: Kernel,
+    task: TaskSpec,
+    start: FloatArray | None,
+    rng: np.random.Generator,
+    log_lengthscale_std: float = SHARED_LOG_LENGTHSCALE_STD,
+) -> tuple[Kernel, float, FloatArray]:
+    """`embedding_hyperparameters` with prior lengthscales no shorter than the inputs are spread.
+
+    Where a policy holds a state, most actions are near each other too, and their median distance
+    says nothing about the others (`as_wide_as_spread`).
+    """
+    fit = HyperparameterFit.from_samples(
+        inputs, targets, state_kernel, task, start, rng, log_lengthscale_std
+    )
+    kernel = as_wide_as_spread(fit.kernel, inputs)
+    wider = np.append(np.log(kernel.lengthscales / fit.kernel.lengthscales), 0.0)
+    prior = replace(
+        fit.prior,
+        centre=fit.prior.centre + wider,
+        low=fit.prior.low + wider,
+        high=fit.prior.high + wider,
+    )
+    given = fit.starts[:-2]
+    others = tuple(each + wider for each in fit.starts[-2:])
+    x = replace(fit, kernel=kernel, prior=prior, starts=(*given, *others)).solve()
+    return kernel.with_lengthscales(np.exp(x[:-1])), float(np.exp(x[-1])), x
+
+
 def fit_coordinates(
     data: Transitions,
     targets: FloatArray,
@@ -192,7 +224,8 @@ def fit_coordinates(
         kernel, and the largest jitter.
     """
     inputs = state_actions(data, task)
-    shared, x = fit_regression(data, targets, state_kernel, task, start, rng)
+    kernel, regulariser, x = wide_hyperparameters(inputs, targets, state_kernel, task, start, rng)
+    shared = embedding_of(kernel, inputs, regulariser)
     errors = shared.leave_one_out(targets).errors
     columns: list[list[int]] = []
     parts: list[KernelExpansion] = []
@@ -200,7 +233,7 @@ def fit_coordinates(
     jitter = shared.factor.jitter
     for group in _groups(targets, task):
         target = targets[:, group]
-        kernel, regulariser, _ = embedding_hyperparameters(
+        kernel, regulariser, _ = wide_hyperparameters(
             inputs, target, state_kernel, task, x, of_own, LOG_LENGTHSCALE_STD
         )
         single = embedding_of(kernel, inputs, regulariser)
