@@ -2,8 +2,8 @@
 
     python benchmarks/suite_picture.py
 
-From ``results/suite.json``, ``suite-peers.json`` and ``suite-before.json``, which holds the former
-contents of ``suite.json``: the same script at earlier commits.
+From ``results/suite.json``, ``results/suite-peers.json`` and ``suite_before.json``, which holds
+former contents of ``suite.json``: runs at earlier commits, named in it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def groups() -> list[tuple[str, list[dict[str, Any]]]]:
     """Labels and runs, in the order in which they are drawn."""
     peers = json.loads((RESULTS / "suite-peers.json").read_text())["runs"]
     found = [(name, [r for r in peers if r["learner"] == name]) for name in ("SAC", "CrossQ")]
-    for before in json.loads((RESULTS / "suite-before.json").read_text()):
+    for before in json.loads(Path(__file__).with_name("suite_before.json").read_text()):
         found.append((f"kreps before ({before['commit'][:7]})", before["results"]))
     now = json.loads((RESULTS / "suite.json").read_text())
     found.append((f"kreps ({now['commit'][:7]})", now["results"]))

@@ -270,7 +270,7 @@ def test_predict_holds_an_action_if_its_state_is_passed_back(learnt: kreps.KREPS
     policy, state = Policy(learnt.state.policy), None
     actions = []
     for t in range(10):
-        action, state = policy.predict(np.array([0.1 * t, 0.1 * t]), state, deterministic=True)
+        action, state = policy.predict(np.array([0.02 * t, 0.0]), state, deterministic=True)
         actions.append(float(action[0]))
     assert runs(actions) == [4, 4, 2]
 
