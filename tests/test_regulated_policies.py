@@ -30,7 +30,7 @@ def idle(noise: float = 0.25) -> CostSensitiveGP:
 def test_a_switching_policy_is_the_regulator_near_its_equilibrium_only() -> None:
     (_, regulator), policy = regulators(compared().world, compared().from_starts, 1), idle(0.04)
     states = np.array([observed(angle, 0.0) for angle in (0.0, 0.1, 0.5, 1.0)])
-    cost = float(regulator.costs(states[2:3])[0])
+    cost = float(regulator.expected_costs(states[2:3])[0])
     switching = SwitchingPolicy(policy.predictor, regulator, cost)
     wanted = np.append(regulator.scaled(states[:3])[:, 0], 0.0)[:, None]
     np.testing.assert_allclose(switching.scaled(states), wanted, atol=1e-12)

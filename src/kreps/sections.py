@@ -116,7 +116,7 @@ class ModelBased(Checked):
             new policy visit, in a second step.  The others are in replayed states, in the first.
         acceptance_rollouts: model rollouts per policy in the acceptance test.  The previous policy
             is kept if the new return is lower by more than one standard error, or where episodes
-            end if it is not higher; 0 accepts all.
+            end if it is not higher, or below what the previous policy earned; 0 accepts all.
         exploration_bonus: of R-max: reward per step of an unexplored region, as a share of the
             difference between the largest and the average reward, above the average, once there
             are the data of 30 mean rollouts.  It is multiplied by 0.35 with the data of each

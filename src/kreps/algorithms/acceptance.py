@@ -3,7 +3,7 @@
 A one-step update can exploit errors of V and of the model together.  Long model rollouts do not
 use V, so policies are compared by them, with common random numbers.  Of the policies of an update
 the best one is kept; the previous policy acts again where it is better by more than one standard
-error, and where episodes end, if it is no worse.
+error, and where episodes end, if it is no worse or earned more (`kreps.algorithms.real_returns`).
 
 Rewards are used as predicted, also in states that are unlike any sample: a reward of an unknown
 state that is too high is corrected by the rollouts that it attracts, and one that is shrunk towards

@@ -89,7 +89,7 @@ def better_of(
 
 
 def with_policy(fit: PolicyFit, policy: SparseGP) -> PolicyFit:
-    """Another policy, in which the next fit starts where it would have without it."""
+    """A fit with another policy; its hyper-parameters, from which the next fit starts, stay."""
     return replace(fit, policy=policy, support=len(policy.states), noise=policy.noise)
 
 

@@ -157,7 +157,7 @@ def model_based_step(
         gain = returns - comparison.returns(state.policy)
         rejected = is_rejected(gain, comparison.has_ends)
         if comparison.has_ends and not rejected:
-            real = real_return(batch, state.policy, comparison.from_starts.end_reward)
+            real = real_return(batch, state, comparison.from_starts)
             rejected = real is not None and is_worse(returns - real + REAL_RETURN_TOLERANCE)
         batch.clock.lap("acceptance test")
     explorer = None

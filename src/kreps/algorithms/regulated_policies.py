@@ -33,9 +33,9 @@ from kreps.kernels.linalg import solve_lower_transposed
 from kreps.policies.base import StochasticPolicy
 from kreps.policies.sparse_gp import SparseGP
 
-COSTS = (1.0, 4.0, 16.0, 64.0)
-"""Costs below which a regulator may act, relative to that within which its feedback stays within
-the limits of the action.  There is a switching policy for each."""
+REGION_SIZES = (1.0, 4.0, 16.0, 64.0)
+"""Expected costs up to which a regulator acts, relative to the one up to which its feedback alone
+changes no scaled action by more than one.  There is a switching policy for each."""
 
 ROLLOUTS = 20
 """Model rollouts of each switching policy.  The fit to the best one is then compared by as many as
@@ -74,12 +74,12 @@ class SwitchingPolicy:
     Attributes:
         policy: that acts elsewhere, with its exploration noise everywhere.
         regulator: that acts near its equilibrium.
-        cost: up to which it does.
+        max_cost: expected cost up to which it does.
     """
 
     policy: SparseGP
     regulator: Regulator
-    cost: float
+    max_cost: float
 
     def scaled(self, states: FloatArray) -> FloatArray:
         """Scaled actions (m, da) around the centre, without noise, at states (m, ds)."""
@@ -90,7 +90,7 @@ class SwitchingPolicy:
         return self.policy.task.unscaled(self._switched(states, mean) + deviation * noise)
 
     def _switched(self, states: FloatArray, actions: FloatArray) -> FloatArray:
-        near = self.regulator.costs(states) <= self.cost
+        near = self.regulator.expected_costs(states) <= self.max_cost
         return np.where(near[:, None], self.regulator.scaled(states), actions)
 
 
@@ -106,9 +106,9 @@ def best_switching_policy(
     """
     few = replace(comparison, rollouts=ROLLOUTS)
     teachers = [
-        SwitchingPolicy(policy, each, relative * each.cost_within_limits)
+        SwitchingPolicy(policy, each, relative * each.cost_of_unit_feedback)
         for each in regulators
-        for relative in COSTS
+        for relative in REGION_SIZES
     ]
     teacher = best_of(few, teachers)
     kernel = policy.kernel.with_lengthscales(LENGTHSCALES * policy.kernel.lengthscales)

@@ -101,7 +101,7 @@ class Regulator:
         deviations[:, angles] = np.sin(deviations[:, angles])
         return deviations
 
-    def costs(self, states: FloatArray) -> FloatArray:
+    def expected_costs(self, states: FloatArray) -> FloatArray:
         """Expected costs (m,) of the way from states (m, ds) to the equilibrium.
 
         Infinite where an angle is more than a quarter of a turn away.
@@ -113,8 +113,8 @@ class Regulator:
         return np.where(far.any(axis=1), np.inf, costs)
 
     @cached_property
-    def cost_within_limits(self) -> float:
-        """Largest cost such that feedback in no state of it exceeds a scaled action of one.
+    def cost_of_unit_feedback(self) -> float:
+        """Largest expected cost up to which feedback alone changes no scaled action by over one.
 
         In the ellipsoid ``d' P d <= c`` the largest feedback ``k' d`` is ``sqrt(c k' P^-1 k)``.
         """

@@ -347,7 +347,7 @@ def fit_dynamics(
     start: FloatArray | None,
     rng: np.random.Generator,
 ) -> tuple[Dynamics, FloatArray, float]:
-    """The dynamics of n transitions, at a cost of n^3 or less (`fit_regression`).
+    """The dynamics of n transitions, at a cost of n^3 or less (`fit_coordinates`).
 
     Args:
         data: n transitions.
