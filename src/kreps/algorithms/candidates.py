@@ -45,8 +45,9 @@ def with_regulators(
     """A policy in which a regulator acts near its equilibrium, if it is better.
 
     Where episodes end, a regulator alone, unless it is worse by a standard error: if both keep an
-    episode going for a whole rollout, the regulator is more likely to do so for longer.  Where no
-    episode ends, a regulator alone exploits errors of the model far from the equilibrium.
+    episode going for a whole rollout, the regulator is more likely to do so for longer, and a fit
+    to another policy less.  Where no episode ends, a regulator alone exploits errors of the model
+    far from the equilibrium.
 
     Args:
         fit, returns, comparison: policy, its returns, and how they are compared.
@@ -60,7 +61,7 @@ def with_regulators(
         alone = best_regulator(comparison, on_its_centres(fit.policy), found, kernel)
         new_returns = comparison.returns(alone)
         if not is_worse(new_returns - returns):
-            fit, returns = with_policy(fit, alone), new_returns
+            return with_policy(fit, alone), new_returns
     switching = best_switching_policy(comparison, on_its_centres(fit.policy), found)
     return better_of(fit, returns, switching, comparison)
 
