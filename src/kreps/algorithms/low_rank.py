@@ -60,11 +60,7 @@ from kreps.models.dynamics import (
     with_terminations,
 )
 from kreps.models.reward_model import RewardModel, regressed_steps, reward_model
-from kreps.models.terminations import (
-    as_probabilities,
-    fit_terminations_in_features,
-    targets_of,
-)
+from kreps.models.terminations import as_probabilities, fit_terminations_in_features, targets_of
 from kreps.models.transition import (
     embedding_hyperparameters,
     embedding_origin,
@@ -80,7 +76,6 @@ from kreps.settings import Grid, LowRank, Settings
 RESIDUAL_TOLERANCE = 1e-6
 """Bases of state-actions and of the policy are complete if the squared residual of every input in
 memory is at most this; the kernels are at most one."""
-
 
 Regressed = tuple[FeatureRegression, LeaveOneOut, FloatArray, Basis]
 """A regression of all samples, its errors on those in memory, log hyper-parameters and features."""
