@@ -16,6 +16,7 @@ from kreps.kernels.kernel import (
     Kernel,
     Periodic,
     SquaredExponential,
+    as_wide_as_spread,
     factors_of,
     median_lengthscales,
 )
@@ -198,6 +199,24 @@ def test_a_constant_column_gets_lengthscale_one(rows: int, value: float) -> None
     x = np.column_stack([np.full(rows, value), rng.normal(size=rows)])
     found = median_lengthscales((SquaredExponential((0,)), Periodic((0,))), x, rng)
     np.testing.assert_array_equal(found, 1.0)
+
+
+def test_lengthscales_are_raised_to_the_spread_of_chords_and_groups() -> None:
+    """An angle held at pi, read on both sides of it, and one sample in ten elsewhere."""
+    rest = np.where(np.arange(100) % 2 == 0, 3.1, -3.1)
+    x = np.column_stack([rest, np.tile([-3.0, 3.0], 50), np.repeat([-4.0, 4.0], 50), rest])
+    x[::10, 0] = 0.0
+    factors = (Periodic((0,)), SquaredExponential((1, 2)), Periodic((3,)))
+    kernel = Kernel(factors, np.array([0.01, 0.01, 0.5]))
+    found = as_wide_as_spread(kernel, x)
+    points = np.exp(1j * x[:, 0])  # root mean square distance from their mean, of points in a plane
+    of_angle = np.sqrt(np.mean(np.abs(points - points.mean()) ** 2))
+    assert of_angle == pytest.approx(0.6, abs=0.01) and np.std(x[:, 0]) > 2.0
+    np.testing.assert_allclose(found.lengthscales, [of_angle, 5.0, 0.5], rtol=1e-12)
+    assert found.factors == kernel.factors
+    turned = x + 2.0 * np.pi * np.arange(100)[:, None] * [1, 0, 0, 1]
+    again = as_wide_as_spread(kernel, turned).lengthscales
+    np.testing.assert_allclose(again, found.lengthscales, rtol=1e-9)
 
 
 def test_duplicates_do_not_change_median_lengthscales() -> None:

@@ -289,6 +289,51 @@ def test_after_a_termination_nothing_more_is_earned() -> None:
     np.testing.assert_array_equal(found.rewards, np.where(found.ended, -2.0, 2.25))
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_the_return_of_one_rollout_is_that_of_a_loop_over_its_steps(seed: int) -> None:
+    """In plain arithmetic: policy, model, nearest sample, noise, limits, end and average."""
+    p, termination, end_reward, unit = 0.1, 0.08, -2.0, 2e-3
+    env = model_env(
+        loo_residuals=unit, termination=termination, end_reward=end_reward, exploring_starts=0.5
+    )
+
+    class Feedback:
+        """Against the speed, with noise."""
+
+        def act(self, states: FloatArray, noise: FloatArray) -> FloatArray:
+            return -3.0 * states[:, 1:] + np.sin(states[:, :1]) + 0.5 * noise
+
+    def reward(inputs: FloatArray, terminations: FloatArray) -> FloatArray:
+        return np.cos(inputs[:, 0]) - 0.1 * inputs[:, 2] ** 2 + 5.0 * terminations
+
+    found = env.evaluate(Feedback(), reward, 1, np.random.default_rng(seed))
+
+    rollouts, rng = turns(), np.random.default_rng(seed)
+    samples = np.concatenate([r.observations[:-1] for r in rollouts])
+    speeds = np.concatenate([r.observations[:, 1] for r in rollouts])
+    start = rollouts[rng.choice(6, 1)[0]].observations[0]
+    anywhere = samples[rng.choice(len(samples), 1)[0]]
+    turn, speed = anywhere if rng.uniform() < 0.5 else start
+    total = weights = 0.0
+    going, lasted = True, 0
+    for t in range(20):
+        earned = end_reward
+        if going:
+            noise, coin, lot = rng.standard_normal(), rng.integers(2), rng.uniform()
+            push = min(max(-3.0 * speed + np.sin(turn) + 0.5 * noise, -2.0), 2.0) / 2.0
+            earned = np.cos(turn) - 0.1 * push**2 + 5.0 * termination
+            chords = 2.0 * np.sin(0.5 * (samples[:, 0] - turn))
+            nearest = int(np.argmin(chords**2 + (samples[:, 1] - speed) ** 2))
+            residual = (1 - 2 * coin) * unit * (nearest + 1)
+            turn += 0.1 * push + residual
+            speed = min(max(speed + 0.02 * push + residual, speeds.min()), speeds.max())
+            going, lasted = lot >= termination, t + 1
+        total += (1.0 - p) ** t * earned
+        weights += (1.0 - p) ** t
+    assert np.count_nonzero(~found.ended) == lasted
+    np.testing.assert_allclose(average_reward(found.rewards, p), [total / weights], rtol=1e-9)
+
+
 def test_without_a_termination_no_rollout_ends() -> None:
     found = model_env(end_reward=-2.0).evaluate(Push(), angle, 30, np.random.default_rng(0))
     assert not found.ended.any()
