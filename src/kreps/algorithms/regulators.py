@@ -91,26 +91,26 @@ class Regulator:
 
     def scaled(self, states: FloatArray) -> FloatArray:
         """Scaled actions (m, da) around the centre, at states (m, ds); they are not limited."""
-        actions: FloatArray = self.action + self.deviations(states) @ self.gains.T
+        deviations = self._deviations(differences(states, self.state, self.task))
+        actions: FloatArray = self.action + deviations @ self.gains.T
         return actions
-
-    def deviations(self, states: FloatArray) -> FloatArray:
-        """Of states (m, ds) from the equilibrium; the sine of that of an angle."""
-        deviations = differences(states, self.state, self.task)
-        angles = list(self.task.periodic)
-        deviations[:, angles] = np.sin(deviations[:, angles])
-        return deviations
 
     def expected_costs(self, states: FloatArray) -> FloatArray:
         """Expected costs (m,) of the way from states (m, ds) to the equilibrium.
 
         Infinite where an angle is more than a quarter of a turn away.
         """
-        angles = list(self.task.periodic)
-        far = np.abs(differences(states, self.state, self.task)[:, angles]) > 0.5 * np.pi
-        deviations = self.deviations(states)
+        relative = differences(states, self.state, self.task)
+        far = np.abs(relative[:, list(self.task.periodic)]) > 0.5 * np.pi
+        deviations = self._deviations(relative)
         costs = np.einsum("ij,jk,ik->i", deviations, self.cost, deviations)
         return np.where(far.any(axis=1), np.inf, costs)
+
+    def _deviations(self, relative: FloatArray) -> FloatArray:
+        """Deviations (m, ds) of states relative to the equilibrium (m, ds); of angles the sine."""
+        deviations, angles = relative.copy(), list(self.task.periodic)
+        deviations[:, angles] = np.sin(deviations[:, angles])
+        return deviations
 
     @cached_property
     def cost_of_unit_feedback(self) -> float:
