@@ -17,8 +17,7 @@ from kreps.algorithms.regulated_policies import best_regulator, best_switching_p
 from kreps.algorithms.regulators import regulators
 from kreps.kernels.arrays import FloatArray
 from kreps.kernels.kernel import Kernel
-from kreps.policies.base import LearntPolicy
-from kreps.policies.cost_sensitive_gp import CostSensitiveGP
+from kreps.policies.cost_sensitive_gp import on_its_centres
 from kreps.policies.sparse_gp import SparseGP
 
 Compared = tuple[PolicyFit, FloatArray]
@@ -92,18 +91,3 @@ def better_of(
 def with_policy(fit: PolicyFit, policy: SparseGP) -> PolicyFit:
     """A fit with another policy; its hyper-parameters, from which the next fit starts, stay."""
     return replace(fit, policy=policy, support=len(policy.states), noise=policy.noise)
-
-
-def on_its_centres(policy: LearntPolicy) -> SparseGP:
-    """A policy on the centres that it is evaluated with.
-
-    Its arrays are as they are read from a file, so that it rounds alike.
-    """
-    assert isinstance(policy, CostSensitiveGP | SparseGP)
-    policy = policy.predictor if isinstance(policy, CostSensitiveGP) else policy
-    return replace(
-        policy,
-        states=np.ascontiguousarray(policy.states),
-        mean_weights=np.ascontiguousarray(policy.mean_weights),
-        explained=np.ascontiguousarray(policy.explained),
-    )

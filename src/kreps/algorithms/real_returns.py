@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from kreps.algorithms.candidates import on_its_centres
 from kreps.algorithms.reps import Batch
 from kreps.algorithms.state import LearnerState
 from kreps.data.rollouts import Transitions
 from kreps.kernels.arrays import BoolArray, FloatArray, as_float
 from kreps.models.model_env import ModelEnv, step_shares
 from kreps.policies.base import LearntPolicy
+from kreps.policies.cost_sensitive_gp import on_its_centres
 
 STANDARD_ERRORS = 5.0
 """By how many the mean squared deviation of the actions of a rollout from a policy, in its standard

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -13,6 +13,7 @@ from kreps.kernels.arrays import FloatArray
 from kreps.kernels.basis import RKHSBasis
 from kreps.kernels.kernel import Kernel
 from kreps.kernels.linalg import Cholesky, cholesky, inverse_lower
+from kreps.policies.base import LearntPolicy
 from kreps.policies.sparse_gp import MIN_RESIDUAL, PolicySums, SparseGP
 
 MAX_SUPPORT = 6_000
@@ -140,3 +141,18 @@ class CostSensitiveGP:
             self.kernel, self.states, tolerance=MIN_RESIDUAL, max_rank=centres
         )
         return self._projected(basis, features)
+
+
+def on_its_centres(policy: LearntPolicy) -> SparseGP:
+    """A policy on the centres that it is evaluated with.
+
+    Its arrays are as they are read from a file, so that it rounds alike.
+    """
+    assert isinstance(policy, CostSensitiveGP | SparseGP)
+    policy = policy.predictor if isinstance(policy, CostSensitiveGP) else policy
+    return replace(
+        policy,
+        states=np.ascontiguousarray(policy.states),
+        mean_weights=np.ascontiguousarray(policy.mean_weights),
+        explained=np.ascontiguousarray(policy.explained),
+    )
