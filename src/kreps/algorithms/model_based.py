@@ -153,25 +153,59 @@ def model_based_step(
         fit, returns = with_gradient_steps(fit, returns, comparison, model_based.gradient_steps)
         batch.clock.lap("policy gradient")
         best = replace(best, policy=fit)
-    if comparison is not None and returns is not None and state.policy is not None:
-        gain = returns - comparison.returns(state.policy)
-        rejected = is_rejected(gain, comparison.has_ends)
-        if comparison.has_ends and not rejected:
-            real = real_return(batch, state, comparison.from_starts)
-            rejected = real is not None and is_worse(returns - real + REAL_RETURN_TOLERANCE)
-        batch.clock.lap("acceptance test")
+        rejected = fails_acceptance_test(batch, state, returns, comparison)
     explorer = None
     if optimistic.bonus is not None:
-        comparison = compare_in_model(optimistic, model_based.acceptance_rollouts, seed)
-        found, returns = optimise(batch, optimistic, step, comparison, rng)
-        fit = found.policy
-        if comparison is not None and returns is not None:
-            count = model_based.random_policies
-            fit, _ = with_random_policies(fit, returns, comparison, count, rng)
-            batch.clock.lap("random policies")
-        explorer = fit.policy
+        explorer = optimise_explorer(batch, optimistic, step, seed, rng)
     step = replace(step, dual=best.dual, policy=best.policy, reward_model=world.reward_model)
     return ModelBasedResult(step, reward_start, rejected, explorer)
+
+
+def fails_acceptance_test(
+    batch: Batch[Any, Any], state: LearnerState, returns: FloatArray, comparison: ModelComparison
+) -> bool | None:
+    """Whether the new policy is worse than the previous one, which then stays; None without one.
+
+    Where episodes end, its return must not be below that of the previous one in truth, either.
+
+    Args:
+        batch: the samples.
+        state: with the previous policy.
+        returns: (rollouts,) of the new policy in the model.
+        comparison: that they are of.
+    """
+    if state.policy is None:
+        return None
+    rejected = is_rejected(returns - comparison.returns(state.policy), comparison.has_ends)
+    if comparison.has_ends and not rejected:
+        real = real_return(batch, state, comparison.from_starts)
+        rejected = real is not None and is_worse(returns - real + REAL_RETURN_TOLERANCE)
+    batch.clock.lap("acceptance test")
+    return rejected
+
+
+def optimise_explorer(
+    batch: Batch[Any, Any], world: WorldModel, step: Step, seed: int, rng: np.random.Generator
+) -> LearntPolicy:
+    """The explorer: a policy optimised with the exploration bonus of the model.
+
+    Args:
+        batch: the samples.
+        world: the learnt model, with the bonus.
+        step: of Algorithm 1 on the samples.
+        seed: of the model rollouts by which policies are compared.
+        rng: of the generated samples and the fits.
+    """
+    model_based = batch.settings.model_based
+    assert model_based is not None
+    comparison = compare_in_model(world, model_based.acceptance_rollouts, seed)
+    found, returns = optimise(batch, world, step, comparison, rng)
+    fit = found.policy
+    if comparison is not None and returns is not None:
+        count = model_based.random_policies
+        fit, _ = with_random_policies(fit, returns, comparison, count, rng)
+        batch.clock.lap("random policies")
+    return fit.policy
 
 
 def optimise(
