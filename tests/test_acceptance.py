@@ -76,9 +76,9 @@ class ModelOfReturns(ModelEnv):
     """Rollouts of one step with the returns of `Policy`, which share a large random number."""
 
     def evaluate(
-        self, policy: Any, reward: Any, count: int, rng: np.random.Generator
+        self, policy: Any, reward: Any, count: int, rng: np.random.Generator, copies: int = 1
     ) -> ModelRollouts:
-        assert self.exploring_starts == 0.0
+        assert self.exploring_starts == 0.0 and copies == 1
         draws = rng.standard_normal(count)
         zeros = np.zeros((1, count))
         return ModelRollouts(

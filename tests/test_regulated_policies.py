@@ -10,7 +10,7 @@ import pytest
 from kreps.algorithms.candidates import with_regulators
 from kreps.algorithms.policy_targets import PolicyFit
 from kreps.algorithms.regulated_policies import (
-    SwitchingPolicy,
+    SwitchingPolicies,
     best_regulator,
     best_switching_policy,
 )
@@ -30,8 +30,8 @@ def idle(noise: float = 0.25) -> CostSensitiveGP:
 def test_a_switching_policy_is_the_regulator_near_its_equilibrium_only() -> None:
     (_, regulator), policy = regulators(compared().world, compared().from_starts, 1), idle(0.04)
     states = np.array([observed(angle, 0.0) for angle in (0.0, 0.1, 0.5, 1.0)])
-    cost = float(regulator.expected_costs(states[2:3])[0])
-    switching = SwitchingPolicy(policy.predictor, regulator, cost)
+    cost = float(regulator.with_expected_costs(states[2:3])[1][0])
+    switching = SwitchingPolicies(policy.predictor, [(regulator, cost)])
     wanted = np.append(regulator.scaled(states[:3])[:, 0], 0.0)[:, None]
     np.testing.assert_allclose(switching.scaled(states), wanted, atol=1e-12)
     noise = np.ones((4, 1))
@@ -39,6 +39,19 @@ def test_a_switching_policy_is_the_regulator_near_its_equilibrium_only() -> None
     np.testing.assert_allclose(
         switching.act(states, noise), TASK.unscaled(wanted) + deviation, rtol=1e-9
     )
+
+
+def test_switching_policies_side_by_side_have_the_returns_of_each_alone() -> None:
+    """Also where episodes end at different steps."""
+    policy, found = idle(1e-2).predictor, regulators(compared().world, compared().from_starts, 2)
+    switches = [(regulator, size) for regulator in found for size in (0.0, 1.0, np.inf)]
+    alone = [compared().returns(SwitchingPolicies(policy, [each])) for each in switches]
+    together = SwitchingPolicies(policy, switches)
+    returns = compared().returns(together, len(switches))
+    np.testing.assert_allclose(returns, np.concatenate(alone), rtol=1e-6, atol=1e-9)
+    means = [float(each.mean()) for each in alone]
+    assert max(means) - min(means) > 0.1
+    assert together.best(compared(), 1).switches == [switches[int(np.argmax(means))]]
 
 
 def test_a_fit_to_the_best_switching_policy_keeps_the_pole_upright() -> None:

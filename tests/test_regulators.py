@@ -109,7 +109,7 @@ def test_constant_coordinates_and_angles_have_a_scale() -> None:
     np.testing.assert_allclose(turned, [[0.0], [2.0 * np.sin(0.1)]], atol=1e-12)
     around = np.array([[3.0, 1.0, 3.1], [0.0, 0.0, 3.2 - 2.0 * np.pi], [0.0, 0.0, 1.5]])
     wanted = [9.0 + 2.0, 4.0 * np.sin(0.1) ** 2, np.inf]  # the last one is beyond a quarter turn
-    np.testing.assert_allclose(regulator.expected_costs(around), wanted, rtol=1e-12)
+    np.testing.assert_allclose(regulator.with_expected_costs(around)[1], wanted, rtol=1e-12)
 
 
 def test_feedback_stays_within_the_limits_up_to_a_cost() -> None:
@@ -121,7 +121,7 @@ def test_feedback_stays_within_the_limits_up_to_a_cost() -> None:
     sphere *= np.sqrt(regulator.cost_of_unit_feedback) / np.linalg.norm(sphere, axis=1)[:, None]
     states = np.linalg.solve(root, sphere.T).T
     np.testing.assert_allclose(
-        regulator.expected_costs(states), regulator.cost_of_unit_feedback, rtol=1e-9
+        regulator.with_expected_costs(states)[1], regulator.cost_of_unit_feedback, rtol=1e-9
     )
     np.testing.assert_allclose(np.abs(regulator.scaled(states)).max(), 1.0, rtol=1e-3)
 

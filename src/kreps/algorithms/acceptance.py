@@ -53,15 +53,16 @@ class ModelComparison:
     seed: int
     has_ends: bool = False
 
-    def returns(self, policy: StochasticPolicy) -> FloatArray:
-        """Average reward per step (rollouts,) from each start, standardised.
+    def returns(self, policy: StochasticPolicy, copies: int = 1) -> FloatArray:
+        """Average reward per step (copies * rollouts,) from each start, standardised.
 
         Args:
             policy: with its exploration noise.
+            copies: how often each rollout is made (`ModelEnv.evaluate`).
         """
         world, model_env = self.world, self.from_starts
         rng = np.random.default_rng(self.seed)
-        each = model_env.evaluate(policy, world.reward_model, self.rollouts, rng)
+        each = model_env.evaluate(policy, world.reward_model, self.rollouts, rng, copies)
         bonus = world.bonus
         rewards = each.rewards if bonus is None else bonus.optimistic_rewards(each)
         return average_reward(rewards, model_env.restart_probability)

@@ -19,7 +19,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
 
 import numpy as np
 
@@ -37,11 +36,11 @@ REGION_SIZES = (1.0, 4.0, 16.0, 64.0)
 """Expected costs up to which a regulator acts, relative to the one up to which its feedback alone
 changes no scaled action by more than one.  There is a switching policy for each."""
 
-ROLLOUTS = 20
-"""Model rollouts of each switching policy.  The fit to the best one is then compared by as many as
-all other policies."""
+ROUNDS = ((4, 4), (20, 1))
+"""Rounds in which switching policies are compared: model rollouts of each, and how many remain.
+The fit to the last one is then compared by as many rollouts as all other policies."""
 
-FIT_ROLLOUTS, MAX_FIT_STATES = 60, 2_000
+FIT_ROLLOUTS, MAX_FIT_STATES = 30, 2_000
 """Rollouts of a switching policy in whose states another is fitted to it, and the largest number of
 these states."""
 
@@ -68,18 +67,19 @@ NO_SIGNAL = 1e-12
 
 
 @dataclass(frozen=True)
-class SwitchingPolicy:
-    """A policy that a regulator replaces where the linearised model expects a small cost.
+class SwitchingPolicies:
+    """Policies that a regulator replaces where the linearised model expects a small cost.
+
+    Each acts in an equal part of the rows of a call, so that they are compared side by side.
 
     Attributes:
         policy: that acts elsewhere, with its exploration noise everywhere.
-        regulator: that acts near its equilibrium.
-        max_cost: expected cost up to which it does.
+        switches: of each policy the regulator that acts near its equilibrium, and the expected cost
+            up to which it does.
     """
 
     policy: SparseGP
-    regulator: Regulator
-    max_cost: float
+    switches: Sequence[tuple[Regulator, float]]
 
     def scaled(self, states: FloatArray) -> FloatArray:
         """Scaled actions (m, da) around the centre, without noise, at states (m, ds)."""
@@ -90,8 +90,19 @@ class SwitchingPolicy:
         return self.policy.task.unscaled(self._switched(states, mean) + deviation * noise)
 
     def _switched(self, states: FloatArray, actions: FloatArray) -> FloatArray:
-        near = self.regulator.expected_costs(states) <= self.max_cost
-        return np.where(near[:, None], self.regulator.scaled(states), actions)
+        parts, actions = len(states) // len(self.switches), actions.copy()
+        for number, (regulator, max_cost) in enumerate(self.switches):
+            rows = slice(number * parts, (number + 1) * parts)
+            feedback, costs = regulator.with_expected_costs(states[rows])
+            near = costs <= max_cost
+            actions[rows][near] = feedback[near]
+        return actions
+
+    def best(self, comparison: ModelComparison, count: int) -> SwitchingPolicies:
+        """Those with the largest mean returns in the model, so many at most."""
+        returns = comparison.returns(self, len(self.switches))
+        order = np.argsort(-returns.reshape(len(self.switches), -1).mean(axis=1), kind="stable")
+        return replace(self, switches=[self.switches[k] for k in order[:count]])
 
 
 def best_switching_policy(
@@ -104,13 +115,10 @@ def best_switching_policy(
         policy: that acts far from the equilibria, and whose noise the fit has.
         regulators: one or more.
     """
-    few = replace(comparison, rollouts=ROLLOUTS)
-    teachers = [
-        SwitchingPolicy(policy, each, relative * each.cost_of_unit_feedback)
-        for each in regulators
-        for relative in REGION_SIZES
-    ]
-    teacher = best_of(few, teachers)
+    switches = [(r, size * r.cost_of_unit_feedback) for r in regulators for size in REGION_SIZES]
+    teacher = SwitchingPolicies(policy, switches)
+    for rollouts, remaining in ROUNDS:
+        teacher = teacher.best(replace(comparison, rollouts=rollouts), remaining)
     kernel = policy.kernel.with_lengthscales(LENGTHSCALES * policy.kernel.lengthscales)
     rng = np.random.default_rng((comparison.seed, FIT_PART))
 
@@ -147,19 +155,12 @@ def best_regulator(
         regulators: one or more.
         kernel: over states, at median lengthscales.
     """
-    best, states = best_of(comparison, regulators), comparison.world.states
+    best = max(regulators, key=lambda each: float(comparison.returns(each).mean()))
+    states = comparison.world.states
     kernel = as_wide_as_spread(kernel, states)
     wide = kernel.with_lengthscales(WIDER * kernel.lengthscales)
     fit = fitted(policy, wide, states, best.scaled(states), LINEAR_RIDGE)
     return replace(fit, noise=MIN_ACTION_VARIANCE)
-
-
-Policy = TypeVar("Policy", bound=StochasticPolicy)
-
-
-def best_of(comparison: ModelComparison, policies: Sequence[Policy]) -> Policy:
-    """The policy with the largest mean return in the model."""
-    return max(policies, key=lambda each: float(comparison.returns(each).mean()))
 
 
 def fitted(

@@ -91,26 +91,20 @@ class Regulator:
 
     def scaled(self, states: FloatArray) -> FloatArray:
         """Scaled actions (m, da) around the centre, at states (m, ds); they are not limited."""
-        deviations = self._deviations(differences(states, self.state, self.task))
-        actions: FloatArray = self.action + deviations @ self.gains.T
-        return actions
+        return self.with_expected_costs(states)[0]
 
-    def expected_costs(self, states: FloatArray) -> FloatArray:
-        """Expected costs (m,) of the way from states (m, ds) to the equilibrium.
+    def with_expected_costs(self, states: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Scaled actions (m, da) at states (m, ds), and expected costs (m,) of the way from there.
 
-        Infinite where an angle is more than a quarter of a turn away.
+        Deviations of angles are their sine, and the cost is infinite where an angle is more than a
+        quarter of a turn away.
         """
-        relative = differences(states, self.state, self.task)
-        far = np.abs(relative[:, list(self.task.periodic)]) > 0.5 * np.pi
-        deviations = self._deviations(relative)
-        costs = np.einsum("ij,jk,ik->i", deviations, self.cost, deviations)
-        return np.where(far.any(axis=1), np.inf, costs)
-
-    def _deviations(self, relative: FloatArray) -> FloatArray:
-        """Deviations (m, ds) of states relative to the equilibrium (m, ds); of angles the sine."""
-        deviations, angles = relative.copy(), list(self.task.periodic)
+        angles = list(self.task.periodic)
+        deviations = differences(states, self.state, self.task)
+        far = (np.abs(deviations[:, angles]) > 0.5 * np.pi).any(axis=1)
         deviations[:, angles] = np.sin(deviations[:, angles])
-        return deviations
+        costs = np.sum((deviations @ self.cost) * deviations, axis=1)
+        return self.action + deviations @ self.gains.T, np.where(far, np.inf, costs)
 
     @cached_property
     def cost_of_unit_feedback(self) -> float:

@@ -177,6 +177,7 @@ class ModelEnv:
         reward: Callable[[FloatArray, FloatArray], FloatArray],
         count: int,
         rng: np.random.Generator,
+        copies: int = 1,
     ) -> ModelRollouts:
         """Rollouts of a policy without random restarts.
 
@@ -184,17 +185,23 @@ class ModelEnv:
             policy: with its exploration noise.
             reward: expected reward (m,) of states and scaled, applied actions (m, ds + da), and of
                 probabilities of a termination (m,).
-            count: number of rollouts.
+            count: number of starts.
             rng: of starts and noise.
+            copies: how often there are rollouts with the same starts and noise, all first ones
+                first, for a policy that acts in each in another way.
+
+        Returns:
+            The rollouts (steps, copies * count).
         """
         steps, size = self.evaluation_steps, self.task.state_size + self.task.action_size
-        inputs = np.zeros((steps, count, size))
-        similarity, terminations = np.ones((steps, count)), np.zeros((steps, count))
-        ended = np.ones((steps, count), dtype=bool)
-        states = self.starts(count, rng)
-        going = np.arange(count)  # the others have ended
+        every = np.tile(np.arange(count), copies)
+        inputs = np.zeros((steps, len(every), size))
+        similarity, terminations = np.ones((steps, len(every))), np.zeros((steps, len(every)))
+        ended = np.ones((steps, len(every)), dtype=bool)
+        states = self.starts(count, rng)[every]
+        going = np.arange(len(every))  # the others have ended
         for t in range(steps):
-            noise = RolloutNoise.sample(count, self.task.action_size, rng)
+            noise = RolloutNoise.sample(count, self.task.action_size, rng).of(every)
             commanded = policy.act(states, noise.action_noise)
             step = self.step_with(commanded[going], states[going], noise.of(going))
             inputs[t, going], similarity[t, going] = step.inputs, step.similarity
@@ -204,7 +211,7 @@ class ModelEnv:
             going = going[~step.terminated]
             if not len(going):
                 break
-        rewards = np.full((steps, count), self.end_reward)
+        rewards = np.full((steps, len(every)), self.end_reward)
         rewards[~ended] = reward(inputs[~ended], terminations[~ended])
         return ModelRollouts(rewards, similarity, ended)
 
