@@ -266,6 +266,7 @@ def write_claims(folder: Path) -> list[Path]:
 
 
 HEADINGS = (
+    "column",
     "claim",
     "measure",
     "to be confirmed as",
@@ -291,6 +292,7 @@ def claims_table(assessed: Sequence[Mapping[str, Any]]) -> str:
             numbers = [effect, f"{low} to {high}", mean, f"{each['superiority']:.2f}", p]
         rows.append(
             [
+                each["column"],
                 each["claim"],
                 f"{each['measure']}: {each['comparison']}" + (", paired" if each["paired"] else ""),
                 f"{each['kind']} (margin {each['margin']:g})",
