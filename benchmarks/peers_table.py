@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from kreps.experiments.figures import at_most, value_at
-from kreps.experiments.specs import FEATURES
+from kreps.experiments.specs import FEATURES, with_preset
 from kreps.experiments.tables import markdown
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -73,9 +73,10 @@ def table() -> str:
         mine = [cpu_seconds(curve) for curve in curves]
         lines.append(line(task, "kreps, untuned", curves, mine))
         if task == "swing-up":
-            features = of_kreps("figure-1b.csv", task, FEATURES)
+            method = with_preset(FEATURES, "default")
+            features = of_kreps("figure-1b.csv", task, method)
             seconds = [cpu_seconds(curve) for curve in features]
-            lines.append(line(task, f"{FEATURES} (seeds 0 to 9)", features, seconds))
+            lines.append(line(task, f"{method}, of figure 1b", features, seconds))
         for learner in ("sac", "ppo"):
             if curves := of_peers(task, learner):
                 seconds = [at_most(curve, MARKS[-1])["cpu_seconds"] for curve in curves]
