@@ -246,10 +246,10 @@ def test_a_random_policy_explores_if_it_is_better_and_never_acts(
         drawn.append(replace(policy, mean_weights=-policy.mean_weights))
         return drawn[-1]
 
-    def returns(comparison: ModelComparison, policy: Any) -> FloatArray:
+    def returns(comparison: ModelComparison, policy: Any, copies: int = 1) -> FloatArray:
         if drawn and policy is drawn[-1]:
             return np.full(comparison.rollouts, gain * 1e6)
-        return compare(comparison, policy)
+        return compare(comparison, policy, copies)
 
     monkeypatch.setattr(candidates, "best_random_policy", draw)
     monkeypatch.setattr(ModelComparison, "returns", returns)
