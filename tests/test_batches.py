@@ -23,8 +23,8 @@ ACTING, EXPLORER = Policy(), Policy()
 
 
 def plan(size: float, *policies: Policy, **settings: Any) -> BatchPlan:
-    """A batch of the fifth iteration; a mean rollout has 50 steps."""
-    chosen = Settings(restart_probability=0.02, **settings)
+    """A batch of the fifth iteration, which grows; a mean rollout has 50 steps."""
+    chosen = Settings(**{"restart_probability": 0.02, "growth": 0.25, **settings})
     return BatchPlan(policies or (ACTING,), 0.0, size, chosen, 3, 5)
 
 

@@ -14,7 +14,7 @@ import pytest
 import kreps
 from kreps.errors import ConfigurationError
 from kreps.learning.environment import task_of, time_limit
-from kreps.learning.timescale import choices, restart_probability
+from kreps.learning.timescale import choices, restart_probability, with_batches
 from kreps.presets import settings_of
 from kreps.settings import Settings
 
@@ -276,6 +276,38 @@ def test_a_resumed_learner_makes_the_same_choice(limited: bool, tmp_path: Path) 
     assert (resumed.task.dt, resumed.task.time_limit) == (0.05, 60 if limited else None)
     assert_same(whole, resumed.learn(2, progress=False))
     assert whole.restart_probability == 0.005
+
+
+@pytest.mark.parametrize(
+    ("name", "given", "first", "growth"),
+    [
+        ("kreps/SwingUp-v0", {}, 3, 0.25),
+        ("kreps/SwingUp-v0", {"growth": 0}, 30, 0),
+        ("kreps/SwingUp-v0", {"initial_rollouts": 5}, 5, 0.25),
+        ("kreps/ImageSwingUp-v0", {}, 30, 0),
+        ("kreps/ImageSwingUp-v0", {"growth": 0.5}, 3, 0.5),
+        ("kreps/ImageSwingUp-v0", {"initial_rollouts": 5, "growth": 0.5}, 5, 0.5),
+    ],
+)
+def test_batches_grow_but_in_images(
+    name: str, given: dict[str, Any], first: int, growth: float
+) -> None:
+    env = gym.make(name)
+    learner = kreps.KREPS(env, **given)
+    settings = learner.update_settings
+    assert (settings.initial_rollouts, settings.growth) == (first, growth)
+    assert settings == with_batches(settings, learner.task)
+    kept = {"initial_rollouts": None, "growth": None, **given}
+    assert {each: getattr(learner.settings, each) for each in kept} == kept
+    env.close()
+
+
+def test_the_first_batch_of_images_is_the_large_one() -> None:
+    env = gym.make("kreps/ImageSwingUp-v0")
+    learner = kreps.KREPS(env, restart_probability=0.5, model_based=None)
+    learner.learn(2, progress=False)
+    assert learner.state.rollouts == 30 + 10
+    env.close()
 
 
 def test_a_policy_file_has_the_times_of_the_task(tmp_path: Path) -> None:

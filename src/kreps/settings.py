@@ -69,7 +69,8 @@ class OnPolicySettings(LearnerSettings):
 
     Attributes:
         exploration: the policy of the first rollouts.
-        initial_rollouts: number of rollouts before the first update.
+        initial_rollouts: number of rollouts before the first update.  None is 3 if batches grow and
+            30 if not.
         rollouts_per_iteration: number of rollouts before each later update.  They are made with the
             current policy; or with bang-bang actions of red noise, if the reward of none of the
             newest rollouts depends on the state.
@@ -77,7 +78,7 @@ class OnPolicySettings(LearnerSettings):
             later update has new steps of this share of those seen so far, but at least as many as
             two mean rollouts and at most as many as ``rollouts_per_iteration``.  No rollout is
             longer than two mean rollouts, and more of them are made where episodes end early, up
-            to ten times as many.
+            to ten times as many.  None is 0.25, and 0 where observations are images.
         rollout_lengths: how the lengths are drawn, which are (1 - p) / p steps on average before
             any limit.
             ``"independent"``: each by itself, as printed.  ``"stratified"``: each from the same
@@ -86,17 +87,20 @@ class OnPolicySettings(LearnerSettings):
     """
 
     exploration: Exploration = field(default_factory=Exploration)
-    initial_rollouts: int = 30
+    initial_rollouts: int | None = 30
     rollouts_per_iteration: int = 10
-    growth: float = 0.0
+    growth: float | None = 0.0
     rollout_lengths: RolloutLengths = "independent"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._section("exploration", Exploration)
         self._choose("rollout_lengths", RolloutLengths)
-        self._whole("initial_rollouts", "rollouts_per_iteration", largest=MAX_COUNT)
-        self._check("growth", Real, "finite and >= 0", lambda v: 0 <= v < inf)
+        self._whole("rollouts_per_iteration", largest=MAX_COUNT)
+        if self.initial_rollouts is not None:
+            self._whole("initial_rollouts", largest=MAX_COUNT)
+        if self.growth is not None:
+            self._check("growth", Real, "finite and >= 0, or None", lambda v: 0 <= v < inf)
 
 
 @dataclass(frozen=True)
@@ -142,9 +146,9 @@ class Settings(OnPolicySettings):
     """
 
     restart_probability: float | None = None
-    initial_rollouts: int = 3
-    growth: float = 0.25
-    window_steps: int = 1_000
+    initial_rollouts: int | None = None
+    growth: float | None = None
+    window_steps: int = 3_000
     rollout_lengths: RolloutLengths = "stratified"
     action_repeat: int | None = None
     delay: int = 0

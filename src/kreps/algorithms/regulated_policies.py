@@ -90,9 +90,9 @@ class SwitchingPolicies:
         return self.policy.task.unscaled(self._switched(states, mean) + deviation * noise)
 
     def _switched(self, states: FloatArray, actions: FloatArray) -> FloatArray:
-        parts, actions = len(states) // len(self.switches), actions.copy()
+        size, actions = len(states) // len(self.switches), actions.copy()
         for number, (regulator, max_cost) in enumerate(self.switches):
-            rows = slice(number * parts, (number + 1) * parts)
+            rows = slice(number * size, (number + 1) * size)
             feedback, costs = regulator.with_expected_costs(states[rows])
             near = costs <= max_cost
             actions[rows][near] = feedback[near]

@@ -59,6 +59,7 @@ def batch_size(settings: OnPolicySettings, iteration: int, decisions: float) -> 
         decisions: made so far.
     """
     if iteration == 0:
+        assert settings.initial_rollouts is not None
         return settings.initial_rollouts
     if not settings.growth:
         return settings.rollouts_per_iteration

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from kreps.errors import ConfigurationError, shown
 from kreps.kernels.arrays import default_errstate
+from kreps.learning import timescale
 from kreps.learning.batches import BatchPlan, Collected, batch_size, collect_batch
 from kreps.learning.environment import Environment
 from kreps.learning.learner import Learner
@@ -29,6 +30,10 @@ class OnPolicyLearner(Learner[OnPolicy]):
 
     These are the rollouts of Sec. 4.1.
     """
+
+    @property
+    def update_settings(self) -> OnPolicy:
+        return timescale.with_batches(super().update_settings, self.task)
 
     def _collect(self, env: Environment, on_rollout: Callable[[int], None] | None) -> Collected:
         return collect_batch(env, self.task, self._batch_plan(), on_rollout)
