@@ -54,13 +54,13 @@ def batch_size(settings: OnPolicySettings, iteration: int, decisions: float) -> 
     """Size of the batch of an iteration, in mean rollouts.
 
     Args:
-        settings: ``initial_rollouts``, ``rollouts_per_iteration`` and ``growth``.
+        settings: ``initial_rollouts``, ``rollouts_per_iteration`` and ``growth``, of an update:
+            nothing in them is left to be chosen.
         iteration: updates so far.
         decisions: made so far.
     """
     if iteration == 0:
-        assert settings.initial_rollouts is not None
-        return settings.initial_rollouts
+        return settings.initial_rollouts  # type: ignore[return-value]  # chosen, in an update
     if not settings.growth:
         return settings.rollouts_per_iteration
     grown = settings.growth * decisions * settings.p
