@@ -29,7 +29,7 @@ from kreps.settings import (
 MODEL_BASED: dict[str, Any] = {
     "restart_probability": None,
     "window": 30,
-    "window_steps": 3000,
+    "window_steps": 2500,
     "exploration.noise": "bang-bang",
     "exploration.scale": 1.0,
     "initial_rollouts": None,

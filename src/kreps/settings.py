@@ -148,7 +148,7 @@ class Settings(OnPolicySettings):
     restart_probability: float | None = None
     initial_rollouts: int | None = None
     growth: float | None = None
-    window_steps: int = 3_000
+    window_steps: int = 2_500
     rollout_lengths: RolloutLengths = "stratified"
     action_repeat: int | None = None
     delay: int = 0
