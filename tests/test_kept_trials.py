@@ -25,6 +25,7 @@ def test_a_figure_shows_the_trials_that_are_kept(figure: str) -> None:
     with (RESULTS / f"{figure}.csv").open() as file:
         published = [{k: v for k, v in row.items() if v} for row in csv.DictReader(file)]
     seeds = {int(row["seed"]) for row in published}
+    settings = json.loads((RESULTS / f"{figure}.json").read_text())["settings"]
     kept, fingerprints = [], set()
     for trial in figure_trials(figure, len(seeds), None):
         result = read_trial(trial, RESULTS / "trials")
@@ -32,8 +33,7 @@ def test_a_figure_shows_the_trials_that_are_kept(figure: str) -> None:
         kept += [as_published(row) for row in result["rows"]]
         if result["code"]:
             fingerprints.add(trial.curve)
-        curves = json.loads((RESULTS / f"{figure}.json").read_text())["settings"]
-        assert curves[f"{trial.task}: {trial.method}"] == result["settings"]
+        assert settings[f"{trial.task}: {trial.method}"] == result["settings"]
     assert len(kept) == len(published)
     assert all(row in published for row in kept)
     assert len(fingerprints) == len({trial.curve for trial in figure_trials(figure, 1, None)})

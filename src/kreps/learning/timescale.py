@@ -1,7 +1,8 @@
 """The time scale of learning where the settings leave it open: how long rollouts are, how often a
 policy decides, and how many rollouts there are before an update.
 
-docs/decisions/0020-time-that-fits-the-task.md has the reasons and what was measured.
+docs/decisions/0020-time-that-fits-the-task.md has the reasons and what was measured; of batches,
+docs/deviations.md.
 """
 
 from __future__ import annotations
@@ -61,9 +62,8 @@ def with_batches(settings: AnyOnPolicy, task: TaskSpec) -> AnyOnPolicy:
     """The settings with the size of the batches where it is left open.
 
     Batches grow with the data where policies can be rolled out in the model: a model of three
-    rollouts is enough to find a better policy.  In images they cannot.  There the policies of small
-    batches fail in the same way, and their rollouts add nothing that would correct them; so the
-    batches are those of the paper.
+    rollouts is enough to find a better policy.  In images they cannot, and with small first batches
+    learning stayed in a local optimum; so the batches there are those of the paper.
 
     Args:
         settings: ``growth`` and ``initial_rollouts`` stay if they are given.
